@@ -1,0 +1,151 @@
+// What all binding files share: numpy arrays in and out, and configurations as keyword-only Python classes.
+#pragma once
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/shared_ptr.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <memory>
+#include <optional>
+#include <string>
+#include <utility>
+#include <variant>
+#include <vector>
+
+#include "palpate/pipeline.hpp"
+
+namespace nb = nanobind;
+
+namespace palpate_py {
+
+using Vector = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Rows = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Stack = nb::ndarray<const double, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using Flags = nb::ndarray<const bool, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Times = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+
+/// A new numpy array of the given shape, and the memory to fill.
+template <class T>
+struct Output {
+  T* data;
+  nb::object array;
+  explicit Output(std::vector<std::size_t> shape) {
+    std::size_t size = 1;
+    for (std::size_t s : shape) size *= s;
+    auto* memory = new std::vector<T>(size);
+    data = memory->data();
+    nb::capsule owner(memory, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
+    array = nb::cast(nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner));
+  }
+};
+
+inline void expect(bool ok, const std::string& what) {
+  if (!ok) throw nb::value_error(what.c_str());
+}
+inline palpate::JointVector joints(const Vector& a, int n, const char* name) {
+  expect(a.shape(0) == static_cast<std::size_t>(n), std::string(name) + ": expected " + std::to_string(n) + " numbers, got " + std::to_string(a.shape(0)));
+  palpate::JointVector out{};
+  for (std::size_t i = 0; i < static_cast<std::size_t>(n); ++i) out[i] = a.data()[i];
+  return out;
+}
+inline palpate::JointVector row(const double* data, std::size_t i, int n) {
+  palpate::JointVector out{};
+  for (std::size_t j = 0; j < static_cast<std::size_t>(n); ++j) out[j] = data[i * static_cast<std::size_t>(n) + j];
+  return out;
+}
+/// Runs `work` without the interpreter lock; no Python object may be touched in it.
+template <class Work>
+void unlocked(Work&& work) {
+  nb::gil_scoped_release release;
+  work();
+}
+inline nb::object array(const palpate::JointVector& v, int n) {
+  Output<double> out({static_cast<std::size_t>(n)});
+  for (std::size_t j = 0; j < static_cast<std::size_t>(n); ++j) out.data[j] = v[j];
+  return out.array;
+}
+
+/// One field of a configuration: its name, where it is, what it means.
+template <class C>
+struct Option {
+  const char* name;
+  std::variant<double C::*, int C::*, bool C::*, palpate::Solver C::*> member;
+  const char* doc;
+};
+
+/// Binds configuration C as a Python class with keyword-only arguments, read-only properties, options() and repr.
+/// An unknown keyword is an error that lists the known ones; ranges are checked when a pipeline is built.
+template <class C>
+void bind_config(nb::module_& m, const char* name, const char* doc, std::vector<Option<C>> options) {
+  std::string text = std::string(doc) + "\n\nKeyword arguments:";
+  const C defaults{};
+  for (const auto& option : options) text += std::string("\n    ") + option.name + ": " + option.doc;
+  auto* kept = new std::vector<Option<C>>(std::move(options));  // lives as long as the module
+  auto* docs = new std::string(std::move(text));
+  auto get = [](const C& c, const Option<C>& option) -> nb::object {
+    return std::visit([&](auto member) -> nb::object {
+      if constexpr (std::is_same_v<decltype(member), palpate::Solver C::*>) {
+        constexpr const char* names[] = {"euler", "rk4", "dormand_prince"};
+        return nb::str(names[static_cast<int>(c.*member)]);
+      } else {
+        return nb::cast(c.*member);
+      }
+    }, option.member);
+  };
+  nb::class_<C> type(m, name, docs->c_str());
+  type.def("__init__", [kept, name](C* self, const nb::kwargs& kwargs) {
+    C c{};
+    for (auto item : kwargs) {
+      const std::string key = nb::cast<std::string>(nb::handle(item.first));
+      const Option<C>* found = nullptr;
+      std::string known;
+      for (const auto& option : *kept) {
+        if (key == option.name) found = &option;
+        known += (known.empty() ? "" : ", ") + std::string(option.name);
+      }
+      expect(found != nullptr, std::string(name) + ": unknown option '" + key + "'; choose from " + known);
+      const nb::handle value = item.second;
+      std::visit([&](auto member) {
+        using Field = std::remove_reference_t<decltype(c.*member)>;
+        try {
+          if constexpr (std::is_same_v<Field, palpate::Solver>) {
+            const std::string solver = nb::cast<std::string>(value);
+            expect(solver == "euler" || solver == "rk4" || solver == "dormand_prince",
+                   std::string(name) + ": solver '" + solver + "'; choose from euler, rk4, dormand_prince");
+            c.*member = solver == "euler" ? palpate::Solver::euler : solver == "rk4" ? palpate::Solver::rk4 : palpate::Solver::dormand_prince;
+          } else {
+            c.*member = nb::cast<Field>(value);
+          }
+        } catch (const nb::cast_error&) {
+          expect(false, std::string(name) + ": option '" + key + "' has the wrong type, got " + nb::cast<std::string>(nb::repr(value)));
+        }
+      }, found->member);
+    }
+    new (self) C(c);
+  });
+  for (const auto& option : *kept)
+    type.def_prop_ro(option.name, [get, &option](const C& c) { return get(c, option); }, option.doc);
+  type.def("options", [get, kept](const C& c) {
+    nb::dict out;
+    for (const auto& option : *kept) out[option.name] = get(c, option);
+    return out;
+  }, "All options as a dict; the class called with it gives an equal object.");
+  type.def("__repr__", [get, kept, name](const C& c) {
+    std::string out = std::string(name) + "(";
+    bool first = true;
+    for (const auto& option : *kept) {
+      out += (first ? "" : ", ") + std::string(option.name) + "=" + nb::cast<std::string>(nb::repr(get(c, option)));
+      first = false;
+    }
+    return out + ")";
+  });
+  (void)defaults;
+}
+
+void bind_arm(nb::module_& m);
+void bind_pipeline(nb::module_& m);
+void bind_control(nb::module_& m);
+
+}  // namespace palpate_py

@@ -1,0 +1,10 @@
+// palpate._core: the C++ core as a Python module. Shapes and types are checked here; no mathematics.
+#include "common.hpp"
+
+NB_MODULE(_core, m) {
+  m.doc() = "palpate's C++ core. Use the palpate package; this module is its inside.";
+  m.attr("__version__") = PALPATE_VERSION;
+  palpate_py::bind_arm(m);
+  palpate_py::bind_pipeline(m);
+  palpate_py::bind_control(m);
+}

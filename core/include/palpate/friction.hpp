@@ -1,0 +1,89 @@
+// Friction of one joint: Coulomb, viscous, offset, Stribeck, load-dependent; with its derivative and its uncertainty.
+#pragma once
+#include <cmath>
+#include <cstdio>
+#include <limits>
+#include <string>
+
+namespace palpate {
+
+/// tau_f = (F_c + (F_s - F_c0) exp(-(dq/v_s)^2)) tanh(dq/v_0) + F_v dq + F_o,   F_c = F_c0 + load |tau_load|
+/// (MATH.md section 6), on the side of M q'' + C q' + g + tau_f = tau + tau_ext: tau_f > 0 brakes forward motion.
+///
+/// dq [rad/s]; F_c0 coulomb, F_v viscous, F_o offset, F_s static_, v_s stribeck_velocity, v_0 sign_velocity.
+/// tanh stands for sgn, so that derivatives exist. The Stribeck excess F_s - F_c0 does not depend on the load: with
+/// load, static friction rises as much as Coulomb friction does.
+struct Friction {
+  double coulomb = 0.0;   ///< F_c0 [N m]
+  double viscous = 0.0;   ///< F_v [N m s/rad]
+  double offset = 0.0;    ///< F_o [N m]
+  double static_ = std::numeric_limits<double>::quiet_NaN();            ///< F_s [N m]; NaN: no Stribeck effect
+  double stribeck_velocity = std::numeric_limits<double>::quiet_NaN();  ///< v_s [rad/s]; needed only with static_
+  double load = 0.0;            ///< Coulomb friction per load torque [1]
+  double sign_velocity = 1e-2;  ///< v_0 [rad/s], width of the smooth sign
+
+  [[nodiscard]] bool has_stribeck() const noexcept { return !std::isnan(static_); }
+
+  /// Friction torque [N m]. T: double, or any scalar with + - * / and tanh, exp, abs found by its namespace.
+  /// tau_load [N m]: torque the gear transmits, of either sign; T or double.
+  template <class T, class L = double>
+  [[nodiscard]] T torque(const T& dq, const L& tau_load = L(0.0)) const noexcept {
+    using std::abs, std::exp, std::tanh;
+    T level = T(coulomb + load * abs(tau_load));
+    if (has_stribeck()) {
+      const T x = dq / stribeck_velocity;
+      level = level + (static_ - coulomb) * exp(x * x * -1.0);
+    }
+    return level * tanh(dq / sign_velocity) + viscous * dq + offset;
+  }
+
+  /// d tau_f / d dq [N m s/rad].
+  [[nodiscard]] double derivative(double dq, double tau_load = 0.0) const noexcept {
+    const double sign = std::tanh(dq / sign_velocity);
+    double level = coulomb + load * std::abs(tau_load);
+    double slope = viscous;
+    if (has_stribeck()) {
+      const double x = dq / stribeck_velocity;
+      const double excess = (static_ - coulomb) * std::exp(-x * x);
+      level += excess;
+      slope -= 2.0 * x / stribeck_velocity * excess * sign;
+    }
+    return slope + level * (1.0 - sign * sign) / sign_velocity;
+  }
+
+  /// Standard deviation [N m] of the friction torque about torque().
+  ///
+  /// At rest friction is any torque within +-F, F = max(F_c, F_s): uniform, hence F/sqrt(3). In motion the model is good
+  /// to fraction F_c, fraction [1]. In between the variances are mixed with the weight 1 - tanh^2(dq/v_0) of "at rest".
+  [[nodiscard]] double uncertainty(double dq, double fraction, double tau_load = 0.0) const noexcept {
+    const double sign = std::tanh(dq / sign_velocity);
+    const double moving = coulomb + load * std::abs(tau_load);
+    const double excess = has_stribeck() ? std::fmax(0.0, static_ - coulomb) : 0.0;
+    const double rest_var = (moving + excess) * (moving + excess) / 3.0;
+    const double moving_std = fraction * moving;
+    return std::sqrt((1.0 - sign * sign) * rest_var + sign * sign * moving_std * moving_std);
+  }
+
+  /// What is wrong with the parameters, in one line; empty if nothing is. Every constructor that takes one asks.
+  [[nodiscard]] std::string problem() const {
+    const auto not_negative = [](double x) { return std::isfinite(x) && x >= 0.0; };
+    const auto positive = [](double x) { return std::isfinite(x) && x > 0.0; };
+    const auto says = [](const char* what, double x, const char* unit, const char* expected) {
+      char line[160];
+      std::snprintf(line, sizeof line, "friction %s = %.9g %s; expected %s", what, x, unit, expected);
+      return std::string(line);
+    };
+    if (!not_negative(coulomb)) return says("coulomb", coulomb, "N m", "a finite number >= 0");
+    if (!not_negative(viscous)) return says("viscous", viscous, "N m s/rad", "a finite number >= 0");
+    if (!std::isfinite(offset)) return says("offset", offset, "N m", "a finite number");
+    if (!not_negative(load)) return says("load", load, "N m/N m", "a finite number >= 0");
+    if (!positive(sign_velocity)) return says("sign_velocity", sign_velocity, "rad/s", "a finite number > 0");
+    if (!has_stribeck()) return {};
+    if (!not_negative(static_)) return says("static", static_, "N m", "a finite number >= 0, or NaN for none");
+    if (!positive(stribeck_velocity))
+      return says("stribeck_velocity", stribeck_velocity, "rad/s", "a finite number > 0, because static is given");
+    return {};
+  }
+};
+
+}  // namespace palpate

@@ -1,0 +1,50 @@
+// The concept every disturbance observer obeys, and what several of them share.
+#pragma once
+#include <concepts>
+
+#include "palpate/chain.hpp"
+#include "palpate/check.hpp"
+
+namespace palpate {
+
+/// Turns conditioned samples into the torque the environment exerts on the joints. Laws (core/tests/laws_test.cpp):
+/// nothing in, nothing out; a known push is recovered; a run in pieces equals the whole run; reset() equals new.
+template <class O>
+concept DisturbanceObserver = requires(O o, const JointSample& s) {
+  { o.step(s) } noexcept -> std::same_as<ExternalTorque>;
+  o.reset();
+};
+
+namespace detail {
+
+inline bool unusable(const JointSample& s) noexcept {
+  return s.status == Status::non_finite || s.status == Status::time_error;
+}
+
+/// Standard deviation of the generalised momentum p = M q' from that of q' [N m s], with the inertia of a pose nearby:
+/// M is refreshed once a joint has moved by 0.1 rad, so that a step stays one sweep.
+class MomentumNoise {
+ public:
+  const JointVector& variance(const Arm& arm, const JointSample& s) noexcept {
+    bool moved = !valid_;
+    for (int j = 0; j < arm.n(); ++j) moved = moved || std::abs(s.q[at(j)] - q_[at(j)]) > 0.1;
+    if (moved) {
+      const JointMatrix M = mass_matrix<double>(arm, s.q);
+      for (int i = 0; i < arm.n(); ++i) {
+        double sum = 0.0;
+        for (int j = 0; j < arm.n(); ++j) sum += M(i, j) * M(i, j) * s.dq_std[at(j)] * s.dq_std[at(j)];
+        variance_[at(i)] = sum;
+      }
+      q_ = s.q;
+      valid_ = true;
+    }
+    return variance_;
+  }
+
+ private:
+  JointVector q_{}, variance_{};
+  bool valid_ = false;
+};
+
+}  // namespace detail
+}  // namespace palpate

@@ -1,0 +1,319 @@
+// Payload Kalman filter: the mass of what is held, and where it is held, from positions and torques, at rest and in motion.
+#pragma once
+#include <algorithm>
+
+#include "palpate/check.hpp"
+#include "palpate/kalman.hpp"
+
+namespace palpate {
+
+struct PayloadFilterConfig {
+  bool first_moment = false;         ///< estimate m and m (c - grasp); else m alone, held exactly at the grasp point
+  double mass_prior_std = std::numeric_limits<double>::quiet_NaN();  ///< of the mass before anything is known, about 0 [kg];
+                                     ///< NaN: what the arm's torque limits let it hold stretched out, 5 kg if it has none
+  double offset_prior_std = 0.05;    ///< of the grasp point's error, each tip axis [m]
+  double velocity_prior_std = 1.0;   ///< of q' at the start [rad/s]
+  double model_torque_std = 0.0;     ///< error of the arm's model, white per sample, beside the drives' own [N m]
+  double friction_fraction = 0.3;    ///< error of the friction model in motion, part of Coulomb friction [1]
+  double friction_time = 5.0;        ///< how long such an error lasts [s]
+  double change_threshold = 8.0;     ///< a load change is declared at so many standard deviations [1]; infinity: never
+  double min_change = 0.01;          ///< smaller changes of mass are not declared [kg]
+  double max_step = 0.02;            ///< longer intervals are predicted in several steps [s]
+  double ok_relative = 0.05;         ///< status `ok` once mass_std is below the larger of this part of the mass
+  double ok_absolute = 0.01;         ///< and this [kg]
+};
+
+/// State (q, q', theta, b) with
+///   M(q; theta) q'' + C q' + g + tau_f = tau + b,   z = q + encoder rounding
+/// theta = m, or (m, m delta) with delta = c - grasp the offset of the load's centre of mass, in tip axes; b the slowly
+/// varying error of the friction model, one per joint that has Coulomb friction. (MATH.md section 4; kalman.hpp.)
+///
+/// The load is a point mass at the grasp point plus the first moment m delta: linear in theta but for m |delta|^2.
+/// b is a first-order process of standard deviation Friction::uncertainty (wide at rest, where stiction hides any torque
+/// within +-F_c) and time friction_time; a start, a stop and a reversal draw it anew.
+///
+/// Grasp and release: eight hypotheses "the mass jumped s seconds ago" run beside the filter (Willsky, Jones 1976). Each
+/// propagates the error e that a unit jump would leave and correlates it with the innovations y of variance S:
+///   jump = sum(e y/S) / sum(e^2/S),   significance = |sum(e y/S)| / sqrt(sum(e^2/S))  [standard deviations].
+/// The winner's e, times the prior, is added to the covariance, so that the new load is learnt as the first one was.
+class PayloadFilter {
+ public:
+  static constexpr int max_parameters = 4 + 2 * max_joints;
+  using Filter = JointKalman<max_parameters>;
+
+  explicit PayloadFilter(const Arm& arm, const PayloadFilterConfig& config = {})
+      : arm_(&arm),
+        config_(config),
+        loads_(config.first_moment ? 4 : 1),
+        biases_(has_coulomb(arm) ? arm.n() : 0),
+        filter_(arm.n(), loads_, biases_ > 0, has_rounding(arm)) {
+    if (!arm.has_dynamics()) throw std::invalid_argument("PayloadFilter: the arm has no masses; give inertials");
+    if (std::isnan(config.mass_prior_std)) config_.mass_prior_std = holdable_mass(arm);
+    check::positive("PayloadFilterConfig mass_prior_std [kg]", config_.mass_prior_std);
+    check::positive("PayloadFilterConfig offset_prior_std [m]", config.offset_prior_std);
+    check::positive("PayloadFilterConfig velocity_prior_std [rad/s]", config.velocity_prior_std);
+    check::not_negative("PayloadFilterConfig model_torque_std [N m]", config.model_torque_std);
+    check::not_negative("PayloadFilterConfig friction_fraction [1]", config.friction_fraction);
+    check::positive("PayloadFilterConfig friction_time [s]", config.friction_time);
+    check::positive_or_infinite("PayloadFilterConfig change_threshold [std]", config.change_threshold);
+    check::not_negative("PayloadFilterConfig min_change [kg]", config.min_change);
+    check::positive("PayloadFilterConfig max_step [s]", config.max_step);
+    check::positive("PayloadFilterConfig ok_relative [1]", config.ok_relative);
+    check::positive("PayloadFilterConfig ok_absolute [kg]", config.ok_absolute);
+    const Vec3<double> c = arm.p_last_grasp();
+    unit_[0] = about_origin(1.0, c, Sym3<double>{});
+    const Mat3<double> R = arm.R_last_tip();
+    const std::array<Vec3<double>, 3> axes{R.cx, R.cy, R.cz};
+    for (std::size_t k = 0; k < 3; ++k) unit_[k + 1] = {0.0, axes[k], parallel_axis(axes[k], c)};
+    for (int i = 0; i < arm.n(); ++i)
+      torque_variance_[u(i)] = arm.torque_variance(i) + config.model_torque_std * config.model_torque_std;
+    decay_.fill(1.0);
+    set_load_prior();
+    restart_hypotheses();
+  }
+
+  Payload step(const JointSample& s) noexcept {
+    if (s.status == Status::non_finite || s.status == Status::time_error) return report(s, Status::held);
+    if (!started_ || s.status == Status::gap || !(s.dt > 0.0)) {
+      if (started_) forget_load();  // it may have been put down meanwhile
+      begin(s);
+      return report(s, s.status == Status::gap ? Status::gap : Status::warming);
+    }
+    const int steps = 1 + static_cast<int>(s.dt / config_.max_step);
+    for (int k = 0; k < steps; ++k) predict(s, s.dt / steps);
+    filter_.measure_joints(*arm_, s, [this](int i, int e, const Filter::Update& update) {
+      for (Hypothesis& hyp : hypotheses_) {
+        const double seen = hyp.e[u(i)] + (e >= 0 ? hyp.e[u(e)] : 0.0);
+        hyp.num += seen * update.y / update.s;
+        hyp.den += seen * seen / update.s;
+        for (int r = 0; r < filter_.dim(); ++r) hyp.e[u(r)] -= update.K[r] * seen;
+      }
+    });
+    if (!filter_.healthy()) {  // start over rather than report what came out of it
+      set_load_prior();
+      begin(s);
+      return report(s, Status::warming);
+    }
+    look_for_change(s);
+    return report(s, Status::ok);
+  }
+
+  void reset() { *this = PayloadFilter(*arm_, config_); }
+
+  JointVector positions() const noexcept { return filter_.positions(); }
+  JointVector velocities() const noexcept { return filter_.velocities(); }
+  const Filter& filter() const noexcept { return filter_; }
+
+  /// The load as a body on the last link, for the controller's feed-forward (never of negative mass).
+  Inertia<double> load() const noexcept { return physical(load_of_state()); }
+
+ private:
+  static constexpr std::size_t u(int i) noexcept { return static_cast<std::size_t>(i); }
+  static bool has_coulomb(const Arm& arm) noexcept {
+    for (int i = 0; i < arm.n(); ++i)
+      if (arm.joint(i).friction.uncertainty(0.0, 0.0) > 0.0) return true;
+    return false;
+  }
+
+  /// Largest mass every joint could hold with the arm stretched out level [kg].
+  static double holdable_mass(const Arm& arm) noexcept {
+    const Vec3<double> g = arm.gravity(), c = arm.p_last_grasp();
+    double mass = std::numeric_limits<double>::infinity(), reach = std::sqrt(dot(c, c));
+    for (int i = arm.n() - 1; i >= 0; --i) {
+      mass = std::min(mass, arm.joint(i).max_effort / (std::sqrt(dot(g, g)) * std::max(reach, 0.01)));
+      reach += std::sqrt(dot(arm.body(i).p, arm.body(i).p));
+    }
+    return std::isfinite(mass) ? mass : 5.0;
+  }
+
+  static bool has_rounding(const Arm& arm) noexcept {
+    for (int i = 0; i < arm.n(); ++i)
+      if (arm.joint(i).position_resolution > 0.0) return true;
+    return false;
+  }
+
+  struct Hypothesis {
+    std::array<double, Filter::max_dim> e;  ///< state error left now by a unit jump of the mass at `since`
+    double num, den;
+    double age, life;                       ///< [s]
+    std::int64_t since;                     ///< [ns]
+  };
+
+  void begin(const JointSample& s) noexcept {
+    filter_.start(*arm_, s, config_.velocity_prior_std);
+    for (int i = 0; i < biases_; ++i) redraw_bias(i, bias_variance(i, filter_.dq(i)));
+    started_ = true;
+    restart_hypotheses();
+  }
+  void set_load_prior() noexcept {
+    const double m = config_.mass_prior_std, c = config_.offset_prior_std * config_.mass_prior_std;
+    filter_.set_parameter(0, 0.0, m * m);
+    for (int k = 1; k < loads_; ++k) filter_.set_parameter(k, 0.0, c * c);
+  }
+  void forget_load() noexcept {
+    for (int k = 0; k < loads_; ++k) {
+      const double prior = k == 0 ? config_.mass_prior_std : config_.offset_prior_std * config_.mass_prior_std;
+      filter_.set_parameter(k, filter_.parameter(k), prior * prior);
+    }
+  }
+
+  Inertia<double> load_of_state() const noexcept {
+    Inertia<double> load{};
+    for (int k = 0; k < loads_; ++k) load = load + filter_.parameter(k) * unit_[u(k)];
+    return load;
+  }
+  /// Mass not below zero and the first moment within reach of the prior: what the mass matrix may be built with.
+  Inertia<double> physical(const Inertia<double>& load) const noexcept {
+    if (!(load.m > 0.0)) return Inertia<double>{};
+    Vec3<double> moment = load.mc - load.m * arm_->p_last_grasp();
+    const double limit = 4.0 * config_.offset_prior_std * load.m, length = std::sqrt(dot(moment, moment));
+    if (length > limit) moment = (limit / length) * moment;
+    const Vec3<double> c = arm_->p_last_grasp() + (1.0 / load.m) * moment;
+    return about_origin(load.m, c, Sym3<double>{});
+  }
+
+  double bias_variance(int i, double dq) const noexcept {
+    const double std = arm_->joint(i).friction.uncertainty(dq, config_.friction_fraction);
+    return std * std;
+  }
+  void redraw_bias(int i, double variance) noexcept { filter_.set_parameter(loads_ + i, 0.0, variance); }
+  /// -1, 0, +1 with hysteresis: the state of motion whose friction error stays the same.
+  int regime(int i, double dq) const noexcept {
+    const double v0 = arm_->joint(i).friction.sign_velocity;
+    const int before = regime_[u(i)];
+    const double threshold = before == 0 ? 1.25 * v0 : 0.75 * v0;
+    return dq > threshold ? 1 : dq < -threshold ? -1 : 0;
+  }
+
+  void predict(const JointSample& s, double h) noexcept {
+    const double phi = std::exp(-h / config_.friction_time);
+    for (int i = 0; i < biases_; ++i) {
+      const double dq = filter_.dq(i), variance = bias_variance(i, dq);
+      const int now = regime(i, dq);
+      if (now != regime_[u(i)]) {
+        regime_[u(i)] = now;
+        redraw_bias(i, variance);
+      }
+      decay_[u(loads_ + i)] = phi;
+    }
+    JointVector variance = torque_variance_;
+    add_curvature(variance);
+    const Inertia<double> load = load_of_state(), real = physical(load);
+    const int last = arm_->n() - 1;
+    filter_.predict(*arm_, {s.tau, variance, real, load + (-1.0) * real, decay_}, h, [&](const BaseFrame& chain, double* D, int stride) {
+      for (int p = 0; p < loads_; ++p) {
+        const JointVector column = chain.body_torque(last, moved(chain.pose().R, chain.pose().p, unit_[u(p)]));
+        for (int i = 0; i <= last; ++i) D[i * stride + p] = column[u(i)];
+      }
+    });
+    for (int i = 0; i < biases_; ++i)
+      filter_.add_parameter_variance(loads_ + i, (1.0 - phi * phi) * bias_variance(i, filter_.dq(i)));
+    for (Hypothesis& hyp : hypotheses_) {
+      filter_.propagate(hyp.e);
+      hyp.age += h;
+    }
+  }
+
+  /// What linearisation in the mass leaves out, as extra torque variance [N^2 m^2]; both vanish as the mass becomes known.
+  /// Lever: weight torque is m times a lever that moves with q, so var(m) sum_j (d lever_i / dq_j)^2 var(z_j). Without it a
+  /// filter that starts hanging, where the lever is zero, believes in masses it has read from its own noise.
+  /// Inertia: q'' is not linear in m where the load outweighs the links, so (std(m) J_i.a_c)^2 (std(m) J_i.J_i / W_ii)^2.
+  void add_curvature(JointVector& variance) const noexcept {
+    const Pose<double> P = forward_kinematics<double>(*arm_, filter_.positions());
+    const Vec3<double> c = P.p + P.R * arm_->p_last_grasp(), g = arm_->gravity();
+    const double mass_variance = filter_.parameter_variance(0);
+    std::array<Vec3<double>, max_joints> J;
+    Vec3<double> a_c{};
+    for (int j = 0; j < arm_->n(); ++j) {
+      J[u(j)] = jacobian_column(*arm_, P, j, c);
+      a_c = a_c + filter_.acceleration()[u(j)] * J[u(j)];
+      for (int i = 0; i <= j; ++i) {
+        if (arm_->body(i).prismatic) continue;
+        const double slope = dot(cross(P.axis[u(i)], J[u(j)]), g);
+        variance[u(i)] += mass_variance * slope * slope * arm_->position_variance(j);
+        if (i != j) variance[u(j)] += mass_variance * slope * slope * arm_->position_variance(i);
+      }
+    }
+    for (int i = 0; i < arm_->n(); ++i) {
+      const double torque = dot(J[u(i)], a_c), share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
+      variance[u(i)] += mass_variance * torque * torque * std::min(1.0, mass_variance * share * share);
+    }
+  }
+
+  void start_hypothesis(Hypothesis& hyp, std::int64_t now) noexcept {
+    hyp.e.fill(0.0);
+    hyp.e[u(2 * arm_->n())] = 1.0;
+    hyp.num = hyp.den = hyp.age = 0.0;
+    hyp.since = now;
+  }
+  /// Four hypotheses of up to 0.24 s for firm changes and four of up to 1 s for faint ones, evenly staggered.
+  void restart_hypotheses() noexcept {
+    for (int i = 0; i < 8; ++i) {
+      Hypothesis& hyp = hypotheses_[u(i)];
+      start_hypothesis(hyp, 0);
+      hyp.life = i < 4 ? 0.24 : 1.0;
+      hyp.age = hyp.life * (i % 4) / 4.0;
+      hyp.e.fill(0.0);  // empty until its turn comes
+    }
+  }
+
+  void look_for_change(const JointSample& s) noexcept {
+    const Hypothesis* best = nullptr;
+    double best_score = config_.change_threshold * config_.change_threshold;
+    for (const Hypothesis& hyp : hypotheses_) {
+      if (!(hyp.den > 0.0)) continue;
+      const double score = hyp.num * hyp.num / hyp.den;
+      if (score > best_score && std::abs(hyp.num / hyp.den) >= config_.min_change) {
+        best_score = score;
+        best = &hyp;
+      }
+    }
+    if (best != nullptr && mass_std() < config_.mass_prior_std / 3.0) {
+      const double prior = config_.mass_prior_std, c = config_.offset_prior_std * prior;
+      if (changes_ == 0 || s.time_ns - change_seen_ns_ > 300'000'000) {
+        ++changes_;
+        change_time_ns_ = best->since;
+      }
+      change_seen_ns_ = s.time_ns;
+      filter_.add_direction(best->e, best->num / best->den, prior * prior);
+      for (int k = 1; k < loads_; ++k) filter_.add_parameter_variance(k, c * c);
+      restart_hypotheses();
+      return;
+    }
+    for (Hypothesis& hyp : hypotheses_)
+      if (hyp.age >= hyp.life) start_hypothesis(hyp, s.time_ns);
+  }
+
+  double mass_std() const noexcept { return std::sqrt(std::max(filter_.parameter_variance(0), 0.0)); }
+
+  Payload report(const JointSample&, Status status) const noexcept {
+    Payload out;
+    out.mass = filter_.parameter(0);
+    out.mass_std = mass_std();
+    for (int k = 1; k < loads_; ++k) {
+      out.first_moment[u(k - 1)] = filter_.parameter(k);
+      out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0));
+    }
+    out.changes = changes_;
+    out.change_time_ns = change_time_ns_;
+    out.status = status;
+    if (status == Status::ok && !(out.mass_std <= std::max(config_.ok_relative * std::abs(out.mass), config_.ok_absolute)))
+      out.status = Status::warming;
+    return out;
+  }
+
+  const Arm* arm_;
+  PayloadFilterConfig config_;
+  int loads_, biases_;
+  Filter filter_;
+  std::array<Inertia<double>, 4> unit_{};
+  JointVector torque_variance_{};
+  Filter::Parameters decay_{};
+  std::array<int, max_joints> regime_{};
+  std::array<Hypothesis, 8> hypotheses_;
+  bool started_ = false;
+  std::uint32_t changes_ = 0;
+  std::int64_t change_time_ns_ = 0, change_seen_ns_ = 0;
+};
+
+}  // namespace palpate

@@ -1,0 +1,18 @@
+"""Logs of robot arms: open, check, slice, record, save."""
+
+from palpate.logs.columns import ColumnMap, SignalColumns
+from palpate.logs.log import Event, Log, Sample, Signal
+from palpate.logs.recorder import Recorder
+from palpate.logs.repair import Clock, RepairReport
+
+__all__ = [
+    "Clock",
+    "ColumnMap",
+    "Event",
+    "Log",
+    "Recorder",
+    "RepairReport",
+    "Sample",
+    "Signal",
+    "SignalColumns",
+]

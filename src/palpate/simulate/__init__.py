@@ -1,0 +1,26 @@
+"""Simulated arms: dynamics in MuJoCo, sensing with its faults, scenarios. Needs ``palpate[sim]``."""
+
+from __future__ import annotations
+
+from ._render import Camera
+from .plant import Integrator, Load, Plant, Truth
+from .scenarios import Attach, Push, Release, ScenarioEvent, Schedule, StopPushing, pick_and_place
+from .sensing import Fault, FaultKind, SensorModel
+
+__all__ = [
+    "Attach",
+    "Camera",
+    "Fault",
+    "FaultKind",
+    "Integrator",
+    "Load",
+    "Plant",
+    "Push",
+    "Release",
+    "ScenarioEvent",
+    "Schedule",
+    "SensorModel",
+    "StopPushing",
+    "Truth",
+    "pick_and_place",
+]
