@@ -46,6 +46,33 @@ void bind_control(nb::module_& m) {
         const JointCommand command = self.pd.step(target, joints(q, n, "q"), joints(dq, n, "dq"), load, 0);
         return nb::make_tuple(array(command.torque, n), command.status);
       }, nb::arg("q_d"), nb::arg("dq_d"), nb::arg("ddq_d"), nb::arg("q"), nb::arg("dq"), nb::arg("load"), "Returns (torque [N m], status).");
+
+  struct PyLimiter {
+    SafetyLimiter limiter;
+    int n;
+  };
+  nb::class_<PyLimiter>(m, "SafetyLimiter", "The last thing a command passes before the driver: torque, rate, position and velocity limits, faults.")
+      .def("__init__", [](PyLimiter* self, const Vector& torque, const Vector& torque_rate, const Vector& lower, const Vector& upper, const Vector& velocity,
+                          const Vector& approach, const Vector& damping) {
+        const int n = static_cast<int>(torque.shape(0));
+        expect(n >= 1 && n <= max_joints, "SafetyLimiter: 1 to 16 joints");
+        LimiterConfig c;
+        c.torque = joints(torque, n, "torque");
+        c.torque_rate = joints(torque_rate, n, "torque_rate");
+        c.lower = joints(lower, n, "lower");
+        c.upper = joints(upper, n, "upper");
+        c.velocity = joints(velocity, n, "velocity");
+        c.approach = joints(approach, n, "approach");
+        c.damping = joints(damping, n, "damping");
+        new (self) PyLimiter{SafetyLimiter(n, c), n};
+      }, nb::arg("torque"), nb::arg("torque_rate"), nb::arg("lower"), nb::arg("upper"), nb::arg("velocity"), nb::arg("approach"), nb::arg("damping"))
+      .def("step", [](PyLimiter& self, const Vector& torque, const Vector& q, const Vector& dq, const Vector& gravity, double dt) {
+        JointCommand command;
+        command.torque = joints(torque, self.n, "torque");
+        const LimitedCommand out = self.limiter.step(command, joints(q, self.n, "q"), joints(dq, self.n, "dq"), joints(gravity, self.n, "gravity"), dt);
+        return nb::make_tuple(array(out.command.torque, self.n), out.command.status, static_cast<int>(out.limited));
+      }, nb::arg("torque"), nb::arg("q"), nb::arg("dq"), nb::arg("gravity"), nb::arg("dt"), "Returns (torque [N m], status, bits of what limited it).")
+      .def("reset", [](PyLimiter& self, const Vector& torque) { self.limiter.reset(joints(torque, self.n, "torque")); }, nb::arg("torque"));
 }
 
 }  // namespace palpate_py

@@ -2,6 +2,7 @@
 #include "common.hpp"
 
 #include "palpate/observers/published_kalman.hpp"
+#include "palpate/tare.hpp"
 
 using namespace palpate;
 
@@ -234,6 +235,32 @@ void bind_pipeline(nb::module_& m) {
       .def("run", &run, nb::arg("time_ns"), nb::arg("position"), nb::arg("velocity").none(), nb::arg("effort"), nb::arg("model_torque") = nb::none())
       .def("load", [](const PyPipeline& p) { return p.pipeline.load(); })
       .def("reset", [](PyPipeline& p) { p.pipeline.reset(); });
+
+  m.def("tare", [](std::shared_ptr<const Arm> arm, double mass_std, const Times& time, const Rows& position, const OptionalRows& velocity, const Rows& effort) {
+    const std::size_t N = time.shape(0);
+    const int n = arm->n();
+    const auto un = static_cast<std::size_t>(n);
+    const double* q = checked(position, N, n, "position");
+    const double* e = checked(effort, N, n, "effort");
+    const double* v = velocity ? checked(*velocity, N, n, "velocity") : nullptr;
+    JointVector gain{};
+    for (int j = 0; j < n; ++j) gain[static_cast<std::size_t>(j)] = arm->joint(j).effort_gain;
+    TareConfig config;
+    config.mass_std = mass_std;
+    Conditioner conditioner(n, gain);
+    Tare tare(*arm, config);
+    std::size_t used = 0;
+    unlocked([&] {
+      RawSample raw;
+      for (std::size_t i = 0; i < N; ++i) {
+        raw.time_ns = time.data()[i];
+        fill(raw, n, q + i * un, v ? v + i * un : nullptr, e + i * un, nullptr);
+        used += tare.step(conditioner.step(raw)) == Status::ok ? 1u : 0u;
+      }
+    });
+    return nb::make_tuple(array(tare.factors(), n), array(tare.factor_std(), n), used);
+  }, nb::arg("arm"), nb::arg("mass_std"), nb::arg("time_ns"), nb::arg("position"), nb::arg("velocity").none(), nb::arg("effort"),
+        "Mass factor of every link, its standard deviation, and the number of samples used.");
 
   struct PublishedFilter {
     std::shared_ptr<const Arm> arm;

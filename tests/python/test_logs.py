@@ -28,7 +28,11 @@ def make(rows: int = 10, n: int = 3, **changes: object) -> Log:
             "force": Signal(1_000_000_000 + 500_000 * np.arange(2 * rows), np.arange(2.0 * rows), "N"),
             "wrench": Signal(time_ns, np.ones((rows, 6)), "N, N m"),
         },
-        "events": (Event(999_999_999, "start"), Event(1_004_000_000, "grasp", "closed"), Event(2_000_000_000, "end")),
+        "events": (
+            Event(999_999_999, "start"),
+            Event(1_004_000_000, "grasp", "closed"),
+            Event(2_000_000_000, "end"),
+        ),
         "meta": {"effort_unit": "A"},
     }
     return Log(**(arrays | changes))
@@ -39,7 +43,14 @@ def test_a_log_is_immutable():
     log = make(position=position)
     position[0, 0] = 1.0
     assert log.position[0, 0] == 0.0
-    for array in (log.time_ns, log.position, log.velocity, log.effort, log.model_torque, log.signals["force"].value):
+    for array in (
+        log.time_ns,
+        log.position,
+        log.velocity,
+        log.effort,
+        log.model_torque,
+        log.signals["force"].value,
+    ):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1
     with pytest.raises(AttributeError):
@@ -147,9 +158,15 @@ def test_copies_and_pickles():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"time_ns": np.arange(10) * 0.1}, "time_ns must be .N,. integer nanoseconds, got shape .10,. of float64"),
+        (
+            {"time_ns": np.arange(10) * 0.1},
+            "time_ns must be .N,. integer nanoseconds, got shape .10,. of float64",
+        ),
         ({"time_ns": np.full(10, 2**62)}, "within"),
-        ({"position": np.zeros((10, 2))}, r"position must be .N,n. = \(10, 3\) for 10 times and 3 joints, got"),
+        (
+            {"position": np.zeros((10, 2))},
+            r"position must be .N,n. = \(10, 3\) for 10 times and 3 joints, got",
+        ),
         ({"velocity": np.zeros(10)}, "velocity must be"),
         ({"effort": None}, "effort must be"),
         ({"effort": [["a"] * 3] * 10}, "effort must be numbers"),
@@ -204,7 +221,9 @@ def test_the_clock_is_judged_and_not_mended():
     log = make(rows=9, time_ns=time_ns)
     np.testing.assert_array_equal(log.time_ns, time_ns)
     clock = log.repair.clock
-    assert clock == Clock(median_ns=10_000_000, min_ns=-5_000_000, max_ns=100_000_000, gaps=1, repeated=1, backwards=1)
+    assert clock == Clock(
+        median_ns=10_000_000, min_ns=-5_000_000, max_ns=100_000_000, gaps=1, repeated=1, backwards=1
+    )
     assert str(clock) == "spacing 10 ms (min -5, max 100), 1 gaps, 1 repeated times, 1 steps backwards"
     assert not log.repair.clean
     assert make().repair.clean

@@ -1,4 +1,4 @@
-"""Damaged files: every one gives a log with a report or a LogError; none hangs, fills the memory or raises anything else."""
+"""Damaged files: each gives a log with a report or a LogError; none hangs, fills the memory or raises otherwise."""
 
 from __future__ import annotations
 
@@ -23,14 +23,18 @@ FILES_PER_KIND = 250
 def whole() -> Log:
     rng = np.random.default_rng(0)
     time_ns = 10**9 + np.arange(ROWS) * 10**6
-    arrays = {name: rng.standard_normal((ROWS, 3)) for name in ("position", "velocity", "effort", "model_torque")}
+    arrays = {
+        name: rng.standard_normal((ROWS, 3)) for name in ("position", "velocity", "effort", "model_torque")
+    }
     signals = {
         "wrench": Signal(time_ns[::3], rng.standard_normal((ROWS // 3, 6)), "N"),
         "mass": Signal(time_ns[::3], rng.standard_normal(ROWS // 3), "kg"),
         "external_torque": Signal(time_ns, rng.standard_normal((ROWS, 3)), "N m"),
     }
     events = (Event(10**9 + 5, "grasp", "x"),)
-    return Log(time_ns=time_ns, joint_names=NAMES, signals=signals, events=events, meta={"card": "x"}, **arrays)
+    return Log(
+        time_ns=time_ns, joint_names=NAMES, signals=signals, events=events, meta={"card": "x"}, **arrays
+    )
 
 
 def table() -> str:
@@ -73,7 +77,9 @@ def compressed(path: Path) -> None:
 
 def foreign(path: Path) -> None:
     log = whole()
-    np.savez_compressed(path, t=log.time_ns * 1e-9, q=log.position, f=log.signals["wrench"].value[:, 0].repeat(3))
+    np.savez_compressed(
+        path, t=log.time_ns * 1e-9, q=log.position, f=log.signals["wrench"].value[:, 0].repeat(3)
+    )
 
 
 KINDS: dict[str, Callable[[Path], object]] = {
@@ -101,7 +107,9 @@ def damage(data: bytes, rng: random.Random) -> bytes:
         for _ in range(rng.choice((1, 1, 2, 5, 50))):
             found[rng.randrange(len(found))] ^= 1 << rng.randrange(8)
     elif kind < 0.8:
-        found[at : at + rng.choice((1, 4, 8, 100))] = bytes([rng.choice((0, 255, 10, 34, 44))]) * rng.choice((1, 4, 8))
+        found[at : at + rng.choice((1, 4, 8, 100))] = bytes([rng.choice((0, 255, 10, 34, 44))]) * rng.choice(
+            (1, 4, 8)
+        )
     elif kind < 0.9:
         found[at:at] = rng.randbytes(rng.choice((1, 3, 8, 64)))
     else:

@@ -196,7 +196,9 @@ def test_nothing_is_overwritten_unasked(tmp_path):
     with pytest.raises(LogError, match="cannot save a log as '.csv'"):
         log.save(tmp_path / "log.csv")
     early = Log(time_ns=[-1], position=[[1.0]], effort=[[2.0]], joint_names=("a",))
-    with pytest.raises(LogError, match="holds times from 0 to 2..31 s, this log has -1 .. -1 ns; save it as .npz"):
+    with pytest.raises(
+        LogError, match="holds times from 0 to 2..31 s, this log has -1 .. -1 ns; save it as .npz"
+    ):
         early.save(tmp_path / "early.mcap")
     assert not (tmp_path / "early.mcap").exists()
     early.save(tmp_path / "early.npz")
@@ -217,15 +219,16 @@ def test_repairs_are_remembered_by_the_saved_file(tmp_path):
     once = Log.open(tmp_path / "once.mcap")
     once.save(tmp_path / "twice.db3")
     twice = Log.open(tmp_path / "twice.db3")
-    assert set(once.repair.notes) == set(twice.repair.notes) == {
-        "dropped 1 before it was saved: cell that is not a number",
-        "dropped 1 before it was saved: NaN or infinite value",
-    }
+    for log in (once, twice):
+        assert sorted(log.repair.notes) == [
+            "dropped 1 before it was saved: NaN or infinite value",
+            "dropped 1 before it was saved: cell that is not a number",
+        ]
 
 
 # -- bit for bit ------------------------------------------------------------------------------------------------------
 
-SPECIAL = [0.0, -0.0, float("nan"), float("inf"), float("-inf"), 5e-324, -2.2e-308, 1e300, 1.7976931348623157e308, 0.1]
+SPECIAL = [0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, -2.2e-308, 1e300, 1.7976931348623157e308, 0.1]
 BITS = st.one_of(
     st.sampled_from(SPECIAL).map(lambda x: int(np.float64(x).view(np.uint64))), st.integers(0, 2**64 - 1)
 )
@@ -236,7 +239,11 @@ NAME = st.text(st.characters(blacklist_characters="\0", blacklist_categories=("C
 
 def doubles(draw, *shape: int) -> np.ndarray:
     count = int(np.prod(shape))
-    return np.array(draw(st.lists(BITS, min_size=count, max_size=count)), dtype=np.uint64).view(float).reshape(shape)
+    return (
+        np.array(draw(st.lists(BITS, min_size=count, max_size=count)), dtype=np.uint64)
+        .view(float)
+        .reshape(shape)
+    )
 
 
 def times(draw, count: int) -> np.ndarray:
@@ -296,14 +303,17 @@ def test_mcap_library_reads_every_message(tmp_path):
         bag = reader.make_reader(file, validate_crcs=True, decoder_factories=[decoder.DecoderFactory()])
         assert bag.get_header().profile == "ros2"
         summary = bag.get_summary()
-        found = [(c.topic, m.log_time, m.publish_time, s.name, ros) for s, c, m, ros in bag.iter_decoded_messages()]
+        found = [
+            (c.topic, m.log_time, m.publish_time, s.name, ros) for s, c, m, ros in bag.iter_decoded_messages()
+        ]
     assert summary.statistics.message_count == len(found)
     assert summary.statistics.message_start_time == 10**9
     assert summary.statistics.message_end_time == 10**9 + 49 * 10**6
     states = [(t, p, ros) for topic, t, p, _, ros in found if topic == "/joint_states"]
     assert len(states) == 50
     for k, (log_time, publish_time, ros) in enumerate(states):
-        assert log_time == publish_time == ros.header.stamp.sec * 10**9 + ros.header.stamp.nanosec == 10**9 + k * 10**6
+        stamp = ros.header.stamp.sec * 10**9 + ros.header.stamp.nanosec
+        assert log_time == publish_time == stamp == 10**9 + k * 10**6
         assert tuple(ros.name) == NAMES
         assert np.array(ros.position).tobytes() == ramp(k).tobytes()
         assert np.array(ros.velocity).tobytes() == ramp(k, 0.5).tobytes()
@@ -316,7 +326,10 @@ def test_mcap_library_reads_every_message(tmp_path):
         "diagnostic_msgs/msg/DiagnosticArray",
     }
     status = [ros for topic, *_, ros in found if topic == topics.STATUS]
-    assert [(s.name, s.level, s.message) for s in status[0].status] == [("payload", 1, "warming"), ("touch", 0, "ok")]
+    assert [(s.name, s.level, s.message) for s in status[0].status] == [
+        ("payload", 1, "warming"),
+        ("touch", 0, "ok"),
+    ]
     # the indices lead to the same messages as the walk
     with (tmp_path / "run.mcap").open("rb") as file:
         bag = reader.SeekingReader(file, validate_crcs=True)
@@ -349,18 +362,37 @@ def test_any_message_can_be_recorded(tmp_path):
     pytest.importorskip("rosbags.typesys", reason="needs palpate[logs]")
     with Recorder(tmp_path / "run.mcap", NAMES) as recorder:
         recorder.sample(10**9, ramp(1), None, ramp(1))
-        recorder.add("/wrist/wrench", "geometry_msgs/msg/WrenchStamped", 10**9, {"wrench": {"force": {"z": -9.81}}})
+        recorder.add(
+            "/wrist/wrench", "geometry_msgs/msg/WrenchStamped", 10**9, {"wrench": {"force": {"z": -9.81}}}
+        )
         recorder.add("wrist/imu", "sensor_msgs/Imu", 10**9, {"orientation_covariance": range(9)})
-        recorder.add("/plan", "trajectory_msgs/msg/JointTrajectory", 10**9, {"points": [{"positions": [1, 2]}, {}]})
-        recorder.add("/image", "sensor_msgs/msg/Image", 10**9, {"data": b"\1\2", "encoding": "mono8", "is_bigendian": True})
+        recorder.add(
+            "/plan", "trajectory_msgs/msg/JointTrajectory", 10**9, {"points": [{"positions": [1, 2]}, {}]}
+        )
+        recorder.add(
+            "/image",
+            "sensor_msgs/msg/Image",
+            10**9,
+            {"data": b"\1\2", "encoding": "mono8", "is_bigendian": True},
+        )
         for topic, kind, fields, message in (
-            ("/a", "geometry_msgs/msg/Wrenches", {}, "no message type .*; close to it: geometry_msgs/msg/Wrench"),
+            (
+                "/a",
+                "geometry_msgs/msg/Wrenches",
+                {},
+                "no message type .*; close to it: geometry_msgs/msg/Wrench",
+            ),
             ("/a", "std_msgs/msg/Float64", {"value": 1}, "Float64 has no field 'value'; it has data"),
             ("/a", "std_msgs/msg/Float64", {"data": "x"}, "Float64.data: could not convert"),
             ("/a", "std_msgs/msg/Int8", {"data": 300}, "Int8"),
             ("/a", "sensor_msgs/msg/Imu", {"orientation_covariance": [1, 2]}, "expected 9 values, got 2"),
             ("/a", "std_msgs/msg/Header", {"stamp": 5}, "stamp must be a mapping of its fields, got int"),
-            ("/wrist/imu", "std_msgs/msg/Float64", {}, "topic /wrist/imu carries sensor_msgs/msg/Imu, not std_msgs"),
+            (
+                "/wrist/imu",
+                "std_msgs/msg/Float64",
+                {},
+                "topic /wrist/imu carries sensor_msgs/msg/Imu, not std_msgs",
+            ),
             ("/1a", "std_msgs/msg/Float64", {}, "a topic is made of letters"),
         ):
             with pytest.raises(InputError, match=message):
@@ -382,7 +414,7 @@ def test_any_message_needs_its_extra(tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, name, None)
     with Recorder(tmp_path / "run.mcap", NAMES) as recorder:
         recorder.sample(1, ramp(1), None, ramp(1))
-        with pytest.raises(MissingExtraError, match=r'palpate\[logs\]'):
+        with pytest.raises(MissingExtraError, match=r"palpate\[logs\]"):
             recorder.add("/a", "std_msgs/msg/Float64", 1, {})
     assert len(Log.open(tmp_path / "run.mcap")) == 1
 

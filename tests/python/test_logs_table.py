@@ -114,9 +114,13 @@ def test_patterns(tmp_path):
 
 def test_a_missing_column_is_named_with_its_neighbours(tmp_path):
     path = write(tmp_path, "time,joint_pos_1,joint_pos_2,load_1\n1,2,3,4\n2,3,4,5\n")
-    with pytest.raises(LogError, match="no column 'joint_pos1' for position; close to it: joint_pos_1, joint_pos_2"):
+    with pytest.raises(
+        LogError, match="no column 'joint_pos1' for position; close to it: joint_pos_1, joint_pos_2"
+    ):
         Log.open(path, ColumnMap(position=["joint_pos1"]))
-    with pytest.raises(LogError, match=r"no column like 'pos_\{joint\}' for position; close to it: joint_pos_1"):
+    with pytest.raises(
+        LogError, match=r"no column like 'pos_\{joint\}' for position; close to it: joint_pos_1"
+    ):
         Log.open(path, ColumnMap(position="pos_{joint}"))
     with pytest.raises(LogError, match="no column 9 for effort; there are 4, counted from 0 to 3"):
         Log.open(path, ColumnMap(position=1, effort=9))
@@ -173,7 +177,9 @@ def test_named_maps_are_listed():
         gzip.compress((HEADER + rows(5)).encode()),
         gzip.compress((HEADER + rows(2)).encode()) + gzip.compress(rows(3, 2).encode()) + bytes(512),
     ],
-    ids="bom crlf cr tab semicolon blanks padded comments gaps trailing quoted-names quoted-cells gzip gzip-members".split(),
+    ids=(
+        "bom crlf cr tab semicolon blanks padded comments gaps trailing quoted-names quoted-cells gzip members"
+    ).split(),
 )
 def test_every_dialect_gives_the_same_log(tmp_path, text):
     expected = Log.open(write(tmp_path, HEADER + rows(5)))
@@ -213,7 +219,8 @@ def test_damaged_rows_are_dropped_and_counted(tmp_path):
         "NaN or infinite value": 3,
         "absurd value (position beyond 1e6 or other beyond 1e9)": 3,
     }
-    assert log.repair.lines["unreadable time"] == (5, 508, 509)  # lines of the file, the header being the first
+    # lines of the file, the header being the first
+    assert log.repair.lines["unreadable time"] == (5, 508, 509)
     assert log.repair.lines["wrong number of columns"] == (13, 14, 802)
     assert log.repair.rows_read == 1000
     assert f"{len(bad)} dropped" in repr(log)
@@ -285,7 +292,10 @@ def test_a_last_line_without_end_is_noted(tmp_path):
         (b"\n\n", "no rows of numbers"),
         (b"# nothing\n", "only comments"),
         (HEADER.encode(), "no rows of numbers"),
-        ((HEADER + "x,1,1,1,1,1,1\n").encode(), "none of 1 rows is usable: 1 with unreadable time .first at 2."),
+        (
+            (HEADER + "x,1,1,1,1,1,1\n").encode(),
+            "none of 1 rows is usable: 1 with unreadable time .first at 2.",
+        ),
         ((HEADER + "1,a,1,1,1,1,1\n").encode(), "1 with cell that is not a number"),
         (b"time_ns,position_1,effort_1\n1,2,3,4\n2,3,4,5\n", "names 3 columns, but the rows have 4"),
         (HEADER.encode("utf-16"), "UTF-16"),
@@ -354,7 +364,9 @@ def test_times_are_exact_for_any_digits(value, exponent):
         assert exact_ns(text, exponent) == exact
 
 
-@pytest.mark.parametrize("text", ["", "x", "1e99", "-1e99", "nan", "inf", "0x1", "1_0", "1e999999999", "5e18", "1 2"])
+@pytest.mark.parametrize(
+    "text", ["", "x", "1e99", "-1e99", "nan", "inf", "0x1", "1_0", "1e999999999", "5e18", "1 2"]
+)
 def test_no_time(text):
     assert exact_ns(text, 9) is None
     assert exact_ns("1e-999999999", 9) == 0
@@ -369,7 +381,9 @@ def test_numbers_are_read_bit_for_bit(tmp_path_factory, value):
     assert log.position.tobytes() == np.array([float(repr(value))] * 2).tobytes()
 
 
-@pytest.mark.parametrize("text", ["1_0", "0x10", "1d5", "1e", "--1", "1.2.3", "nan(1)", "True", "１", "1L", "+ 1"])
+@pytest.mark.parametrize(
+    "text", ["1_0", "0x10", "1d5", "1e", "--1", "1.2.3", "nan(1)", "True", "１", "1L", "+ 1"]
+)
 def test_no_number(text):
     assert number(text) is None
 
@@ -392,7 +406,9 @@ def test_npz_of_others(tmp_path):
         force=np.arange(4),
         pickled=np.array([{}], dtype=object),
     )
-    columns = ColumnMap(time="times", position="positions", position_unit="deg", effort="torques", signals={"f": "force"})
+    columns = ColumnMap(
+        time="times", position="positions", position_unit="deg", effort="torques", signals={"f": "force"}
+    )
     log = Log.open(path, columns)
     assert log.joint_names == ("joint_1", "joint_2", "joint_3")
     np.testing.assert_array_equal(log.time_ns, [500_000_000, 1_000_000_000, 1_500_000_000, 2_000_000_000])
@@ -481,7 +497,9 @@ def test_recordings_without_header(tmp_path):
     path = data_folder() / "ur10e_innopolis" / "collision_detection_data" / "collision_free.csv"
     if not path.is_file():
         pytest.skip(f"{path} is not there")
-    columns = ColumnMap(time=0, position=range(1, 7), velocity=range(7, 13), effort=range(13, 19), effort_unit="A")
+    columns = ColumnMap(
+        time=0, position=range(1, 7), velocity=range(7, 13), effort=range(13, 19), effort_unit="A"
+    )
     log = Log.open(path, columns)
     assert log.n == 6
     assert len(log) > 1000

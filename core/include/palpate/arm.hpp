@@ -92,6 +92,17 @@ class Arm {
   const Vec3<double>& p_last_grasp() const noexcept { return p_last_grasp_; }
   /// False for an arm given by its kinematics alone (all masses zero): no dynamics can be computed.
   bool has_dynamics() const noexcept { return has_dynamics_; }
+  /// The same arm with every link's mass and inertia times its factor (> 0); geometry and centres of mass stay.
+  Arm scaled(const JointVector& factor) const noexcept {
+    Arm out = *this;
+    for (int j = 0; j < n(); ++j) {
+      const auto u = static_cast<std::size_t>(j);
+      out.d_.joints[u].mass *= factor[u];
+      for (double& x : out.d_.joints[u].inertia) x *= factor[u];
+      out.bodies_[u].inertia = factor[u] * out.bodies_[u].inertia;
+    }
+    return out;
+  }
   /// tau_f(q') of all joints [N m].
   JointVector friction_torque(const JointVector& dq) const noexcept {
     JointVector tau{};
@@ -140,7 +151,7 @@ class Arm {
     const double a = xx - m, b = yy - m, c = zz - m;
     const double p = std::sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0);
     double lo = m, hi = m;
-    if (p > 0.0) {
+    if (p > 1e-12 * std::abs(m)) {  // else p^3 may underflow; the moments are equal then
       const double det = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz);
       const double phi = std::acos(std::clamp(det / (2.0 * p * p * p), -1.0, 1.0)) / 3.0;
       hi = m + 2.0 * p * std::cos(phi);

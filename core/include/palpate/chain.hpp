@@ -325,6 +325,8 @@ class BaseFrame {
   }
 
   const Pose<double>& pose() const noexcept { return pose_; }
+  /// Body j (the last one with its load) about the base origin, base axes.
+  const Inertia<double>& body(int j) const noexcept { return links_[detail::at(j)].I; }
 
   /// tau = M q'' + C q' + g; also fills what derivatives() and the regressors need.
   JointVector inverse_dynamics(const JointVector& ddq) noexcept {

@@ -16,7 +16,7 @@ struct PayloadFilterConfig {
   double model_torque_std = 0.0;     ///< error of the arm's model, white per sample, beside the drives' own [N m]
   double friction_fraction = 0.3;    ///< error of the friction model in motion, part of Coulomb friction [1]
   double friction_time = 5.0;        ///< how long such an error lasts [s]
-  double change_threshold = 8.0;     ///< a load change is declared at so many standard deviations [1]; infinity: never
+  double change_threshold = 7.0;     ///< a load change is declared at so many standard deviations [1]; infinity: never
   double min_change = 0.01;          ///< smaller changes of mass are not declared [kg]
   double max_step = 0.02;            ///< longer intervals are predicted in several steps [s]
   double ok_relative = 0.05;         ///< status `ok` once mass_std is below the larger of this part of the mass
@@ -32,7 +32,7 @@ struct PayloadFilterConfig {
 /// b is a first-order process of standard deviation Friction::uncertainty (wide at rest, where stiction hides any torque
 /// within +-F_c) and time friction_time; a start, a stop and a reversal draw it anew.
 ///
-/// Grasp and release: eight hypotheses "the mass jumped s seconds ago" run beside the filter (Willsky, Jones 1976). Each
+/// Grasp and release: twelve hypotheses "the mass jumped s seconds ago" run beside the filter (Willsky, Jones 1976). Each
 /// propagates the error e that a unit jump would leave and correlates it with the innovations y of variance S:
 ///   jump = sum(e y/S) / sum(e^2/S),   significance = |sum(e y/S)| / sqrt(sum(e^2/S))  [standard deviations].
 /// The winner's e, times the prior, is added to the covariance, so that the new load is learnt as the first one was.
@@ -246,13 +246,13 @@ class PayloadFilter {
     hyp.num = hyp.den = hyp.age = 0.0;
     hyp.since = now;
   }
-  /// Four hypotheses of up to 0.24 s for firm changes and four of up to 1 s for faint ones, evenly staggered.
+  /// Eight hypotheses of up to 0.28 s for firm changes and four of up to 1 s for faint ones, evenly staggered.
   void restart_hypotheses() noexcept {
-    for (int i = 0; i < 8; ++i) {
+    for (int i = 0; i < 12; ++i) {
       Hypothesis& hyp = hypotheses_[u(i)];
       start_hypothesis(hyp, 0);
-      hyp.life = i < 4 ? 0.24 : 1.0;
-      hyp.age = hyp.life * (i % 4) / 4.0;
+      hyp.life = i < 8 ? 0.28 : 1.0;
+      hyp.age = i < 8 ? hyp.life * i / 8.0 : hyp.life * (i - 8) / 4.0;
       hyp.e.fill(0.0);  // empty until its turn comes
     }
   }
@@ -269,14 +269,26 @@ class PayloadFilter {
       }
     }
     if (best != nullptr && mass_std() < config_.mass_prior_std / 3.0) {
-      const double prior = config_.mass_prior_std, c = config_.offset_prior_std * prior;
-      if (changes_ == 0 || s.time_ns - change_seen_ns_ > 300'000'000) {
+      const double jump = best->num / best->den;
+      // A small one soon after a change is what the first guess of its size and instant left over: corrected, not counted.
+      const bool correction = changes_ > 0 && s.time_ns - change_seen_ns_ < 1'000'000'000 && std::abs(jump) < 0.5 * last_jump_;
+      const double prior = correction ? 2.0 * std::abs(jump) : config_.mass_prior_std;
+      if (!correction) {
         ++changes_;
         change_time_ns_ = best->since;
+        change_seen_ns_ = s.time_ns;
+        last_jump_ = std::abs(jump);
       }
-      change_seen_ns_ = s.time_ns;
-      filter_.add_direction(best->e, best->num / best->den, prior * prior);
-      for (int k = 1; k < loads_; ++k) filter_.add_parameter_variance(k, c * c);
+      for (const Hypothesis& hyp : hypotheses_) {  // the change came between the instants that were tried
+        const auto apart = hyp.since > best->since ? hyp.since - best->since : best->since - hyp.since;
+        if (&hyp == best || !(hyp.den > 0.0) || apart > 130'000'000) continue;
+        std::array<double, Filter::max_dim> e = hyp.e;
+        for (int r = 0; r < filter_.dim(); ++r) e[u(r)] -= best->e[u(r)];
+        filter_.add_direction(e, 0.0, jump * jump);
+      }
+      filter_.add_direction(best->e, jump, prior * prior);
+      for (int k = 1; k < loads_; ++k)
+        filter_.add_parameter_variance(k, config_.offset_prior_std * config_.offset_prior_std * prior * prior);
       restart_hypotheses();
       return;
     }
@@ -310,10 +322,11 @@ class PayloadFilter {
   JointVector torque_variance_{};
   Filter::Parameters decay_{};
   std::array<int, max_joints> regime_{};
-  std::array<Hypothesis, 8> hypotheses_;
+  std::array<Hypothesis, 12> hypotheses_;
   bool started_ = false;
   std::uint32_t changes_ = 0;
   std::int64_t change_time_ns_ = 0, change_seen_ns_ = 0;
+  double last_jump_ = 0.0;  // [kg]
 };
 
 }  // namespace palpate

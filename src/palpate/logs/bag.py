@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tempfile
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -34,6 +35,7 @@ from palpate.logs.messages import (
 from palpate.logs.repair import (
     BAD_TIME,
     TIME_LIMIT_NS,
+    BoolArray,
     FloatArray,
     IntArray,
     Tally,
@@ -113,62 +115,113 @@ def _unpack(file: Path, target: Path) -> None:
             raise LogError(f"{file}: not a readable zstd file: {error}") from None
 
 
-class _JointTopic:
-    """The joint states of one topic, in file order."""
+class _Numbers:
+    """Rows of doubles of different lengths, appended one by one; packed, since a recording has millions."""
 
     def __init__(self) -> None:
-        self.decoder = JointStateDecoder()
-        self.times: list[int] = []
-        self.delays: list[int] = []
-        self.places: list[int] = []
-        self.names: list[tuple[str, ...]] = []
-        self.values: tuple[list[bytes], list[bytes], list[bytes]] = ([], [], [])
+        self._data = bytearray()
+        self._counts = array("I")
+
+    def add(self, block: bytes) -> None:
+        self._data += block
+        self._counts.append(len(block) // 8)
+
+    @property
+    def counts(self) -> IntArray:
+        """(M,) length of every row."""
+        return np.array(self._counts, dtype=np.int64)
+
+    def take(self, rows: IntArray, columns: IntArray) -> FloatArray:
+        """(R,k) these columns of these rows, which all must have them."""
+        starts = np.cumsum(self.counts) - self.counts
+        found: FloatArray = np.frombuffer(self._data, dtype="<f8")[starts[rows][:, None] + columns]
+        return found
+
+
+class _Stream:
+    """Times and places of messages, in file order."""
+
+    def __init__(self) -> None:
+        self._times = array("q")
+        self._places = array("q")
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    @property
+    def times(self) -> IntArray:
+        """(M,) [ns]."""
+        return np.array(self._times, dtype=np.int64)
+
+    @property
+    def places(self) -> IntArray:
+        """(M,) number of the message in the bag."""
+        return np.array(self._places, dtype=np.int64)
+
+
+class _JointTopic(_Stream):
+    """The joint states of one topic."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.delays = array("q")  # log time behind stamp [ns]
+        self.fields = (_Numbers(), _Numbers(), _Numbers())
+        self._decoder = JointStateDecoder()
+        self._ids: dict[tuple[str, ...], int] = {}
+        self._id = array("I")
 
     def add(self, message: Message, place: int) -> None:
-        state = self.decoder.decode(message.data)
-        self.times.append(state.time_ns or message.log_time)
-        self.delays.append(message.log_time - self.times[-1])
-        self.places.append(place)
-        self.names.append(state.names)
-        for values, raw in zip(self.values, state[2:], strict=True):
-            values.append(raw)
+        state = self._decoder.decode(message.data)
+        time_ns = state.time_ns or message.log_time
+        self._times.append(time_ns)
+        self._places.append(place)
+        self.delays.append(message.log_time - time_ns)
+        self._id.append(self._ids.setdefault(state.names, len(self._ids)))
+        for numbers, block in zip(self.fields, state[2:], strict=True):
+            numbers.add(block)
 
-    def rows(self, joints: tuple[str, ...]) -> IntArray:
+    @property
+    def names(self) -> list[tuple[str, ...]]:
+        """The different rows of joint names, in order of appearance."""
+        return list(self._ids)
+
+    def of(self, names: tuple[str, ...]) -> IntArray:
+        """Which messages have exactly these names."""
+        return np.flatnonzero(np.array(self._id) == self._ids[names])
+
+    def having(self, joints: tuple[str, ...]) -> IntArray:
         """Which messages have all of these joints."""
-        fits = {names: set(joints) <= set(names) for names in set(self.names)}
-        return np.flatnonzero([fits[names] for names in self.names])
+        fits = np.array([set(joints) <= set(names) for names in self._ids], dtype=bool)
+        return np.flatnonzero(fits[np.array(self._id)])
 
-    def array(self, field: int, rows: IntArray, joints: tuple[str, ...]) -> tuple[FloatArray, Any]:
+    def values(self, field: int, rows: IntArray, joints: tuple[str, ...]) -> tuple[FloatArray, BoolArray]:
         """Values (R,n) of the rows, NaN where a message has none, and the mask (R,) of those that have."""
-        out = np.full((len(rows), len(joints)), np.nan)
-        groups: dict[tuple[str, ...], list[int]] = {}
-        for k, row in enumerate(rows.tolist()):
-            if self.values[field][row]:
-                groups.setdefault(self.names[row], []).append(k)
-        there = np.zeros(len(rows), dtype=bool)
-        for names, members in groups.items():
-            block = b"".join(self.values[field][row] for row in rows[members].tolist())
-            values = np.frombuffer(block, dtype="<f8").reshape(len(members), len(names))
-            out[members] = values[:, [names.index(joint) for joint in joints]]
-            there[members] = True
-        return out, there
+        numbers = self.fields[field]
+        there: BoolArray = numbers.counts[rows] > 0
+        found = np.full((len(rows), len(joints)), np.nan)
+        ids = np.array(self._id)[rows]
+        for names, number in self._ids.items():
+            members = np.flatnonzero(there & (ids == number))
+            if len(members):
+                columns = np.array([names.index(joint) for joint in joints], dtype=np.int64)
+                found[members] = numbers.take(rows[members], columns)
+        return found, there
 
 
-class _Values:
-    """The values of one signal, in file order."""
+class _Values(_Stream):
+    """The values of one signal."""
 
-    def __init__(self, unit: str) -> None:
+    def __init__(self, unit: str, *, stamped: bool, scalar: bool) -> None:
+        super().__init__()
         self.unit = unit
-        self.times: list[int] = []
-        self.places: list[int] = []
-        self.blocks: list[bytes] = []
-        self.stamped = True
-        self.scalar = False
+        self.stamped = stamped
+        self.scalar = scalar
+        self.numbers = _Numbers()
 
     def add(self, time_ns: int, place: int, block: bytes) -> None:
-        self.times.append(time_ns)
-        self.places.append(place)
-        self.blocks.append(block)
+        self._times.append(time_ns)
+        self._places.append(place)
+        self.numbers.add(block)
 
 
 class _Bag:
@@ -215,13 +268,10 @@ class _Bag:
         elif kind in NUMBERS:
             layout = NUMBERS[kind]
             stamp, block = decode_numbers(data, layout)
-            values = self._signal(topic, layout.unit)
-            values.stamped = layout.stamped
-            values.scalar = layout.length == 1
+            values = self._values(topic, layout.unit, stamped=layout.stamped, scalar=layout.length == 1)
             values.add(stamp or message.log_time, self.count, block)
         elif kind in (FLOAT64_ARRAY, FLOAT32_ARRAY):
-            values = self._signal(topic, "")
-            values.stamped = False
+            values = self._values(topic, "", stamped=False, scalar=False)
             values.add(
                 message.log_time, self.count, decode_array(data, "d" if kind == FLOAT64_ARRAY else "f")
             )
@@ -235,9 +285,9 @@ class _Bag:
             return False
         return True
 
-    def _signal(self, key: str, unit: str) -> _Values:
+    def _values(self, key: str, unit: str, *, stamped: bool, scalar: bool) -> _Values:
         if key not in self.values:
-            self.values[key] = _Values(unit)
+            self.values[key] = _Values(unit, stamped=stamped, scalar=scalar)
         return self.values[key]
 
     def _status(self, message: Message) -> None:
@@ -247,8 +297,7 @@ class _Bag:
                 code = np.float64(values.get("code", ""))
             except ValueError:
                 raise CdrError(f"status {name!r} without a code") from None
-            signal = self._signal(f"status/{name}", "")
-            signal.scalar = True
+            signal = self._values(f"status/{name}", "", stamped=True, scalar=True)
             signal.add(time_ns, self.count, code.astype("<f8").tobytes())
 
     def _merge(self, text: str) -> None:
@@ -278,14 +327,13 @@ class _Bag:
         main = self._main(topic)
         states = self.joint_topics.pop(main)
         names = self._joints(states, main, joints)
-        rows = states.rows(names)
-        read = len(states.times)
-        self._others(states, names, rows)
-        time_ns = np.array(states.times, dtype=np.int64)[rows]
-        places = np.array(states.places, dtype=np.int64)[rows]
+        rows = states.having(names)
+        read = len(states)
+        self._others(states, names)
+        time_ns, places = states.times[rows], states.places[rows]
         fields: dict[str, FloatArray] = {}
         for k, field in enumerate(_FIELDS):
-            value, there = states.array(k, rows, names)
+            value, there = states.values(k, rows, names)
             if field == "position" or 2 * np.count_nonzero(there) > len(rows):
                 fields[field] = value
             elif there.any():
@@ -312,7 +360,7 @@ class _Bag:
 
     def _main(self, topic: str | None) -> str:
         """The topic with the joint states of the arm."""
-        there = [name for name, states in self.joint_topics.items() if states.times]
+        there = [name for name, states in self.joint_topics.items() if len(states)]
         if topic is not None:
             if topic in there:
                 return topic
@@ -337,40 +385,33 @@ class _Bag:
         raise LogError(f"{self.path}: {what} among {self.count} messages; {details}")
 
     def _joints(self, states: _JointTopic, topic: str, joints: Sequence[str] | None) -> tuple[str, ...]:
-        counts = Counter(states.names)
         if joints is not None:
             wanted = (joints,) if isinstance(joints, str) else tuple(joints)
-            if not any(set(wanted) <= set(names) for names in counts):
-                known = "; ".join(", ".join(names) for names, _ in counts.most_common(4))
+            if not any(set(wanted) <= set(names) for names in states.names):
+                known = "; ".join(", ".join(names) for names in states.names[:4])
                 raise LogError(
                     f"{self.path}: no message on {topic} has all of {', '.join(wanted)}; there are: {known}"
                 )
             return wanted
-        sets: Counter[frozenset[str]] = Counter()
-        for names, count in counts.items():
-            sets[frozenset(names)] += count
-        largest = max(len(names) for names in sets)
-        best = [names for names in sets if len(names) == largest]
-        if len(best) > 1:
-            choices = "; ".join(", ".join(sorted(names)) for names in best[:4])
+        largest = max(len(set(names)) for names in states.names)
+        best = [names for names in states.names if len(set(names)) == largest]
+        if len({frozenset(names) for names in best}) > 1:
+            choices = "; ".join(", ".join(names) for names in best[:4])
             raise LogError(f"{self.path}: several arms on {topic}; say joints=, one of: {choices}")
-        chosen = next(names for names in states.names if frozenset(names) == best[0])
+        chosen = best[0]
         if not chosen or len(set(chosen)) < len(chosen) or not all(chosen) or "\0" in "".join(chosen):
             raise LogError(
                 f"{self.path}: joint states on {topic} with the names {chosen}; expected one per joint"
             )
         return chosen
 
-    def _others(self, states: _JointTopic, names: tuple[str, ...], rows: IntArray) -> None:
+    def _others(self, states: _JointTopic, names: tuple[str, ...]) -> None:
         """Count the joint states that belong to other joints."""
-        mask = np.ones(len(states.times), dtype=bool)
-        mask[rows] = False
-        groups: dict[tuple[str, ...], list[int]] = {}
-        for row in np.flatnonzero(mask).tolist():
-            groups.setdefault(states.names[row], []).append(states.places[row])
-        for others, places in groups.items():
-            text = ", ".join(others) or "nothing"
-            self.tally.add(f"joint state of {text if len(text) < 80 else text[:77] + '...'}", places)
+        for others in states.names:
+            if not set(names) <= set(others):
+                text = ", ".join(others) or "nothing"
+                places = states.places[states.of(others)].tolist()
+                self.tally.add(f"joint state of {text if len(text) < 80 else text[:77] + '...'}", places)
 
     def _model_torque(
         self, time_ns: IntArray, places: IntArray, names: tuple[str, ...]
@@ -379,11 +420,11 @@ class _Bag:
         model = self.joint_topics.get(topics.MODEL_TORQUE)
         if model is None or not len(time_ns):
             return {}
-        wanted = model.rows(names)
-        value, there = model.array(2, wanted, names)
+        wanted = model.having(names)
+        value, there = model.values(2, wanted, names)
         wanted, value = wanted[there], value[there]
-        row = np.searchsorted(places, np.array(model.places, dtype=np.int64)[wanted]) - 1
-        fits = (row >= 0) & (time_ns[row] == np.array(model.times, dtype=np.int64)[wanted])
+        row = np.searchsorted(places, model.places[wanted]) - 1
+        fits = (row >= 0) & (time_ns[row] == model.times[wanted])
         if 2 * len(np.unique(row[fits])) <= len(time_ns):
             return {}  # of another rate or clock: stays a signal
         del self.joint_topics[topics.MODEL_TORQUE]
@@ -398,8 +439,8 @@ class _Bag:
 
         Zero unless the two clocks differ, as for a simulator's clock recorded by wall clock.
         """
-        delay = int(np.median(states.delays))
-        if abs(delay) < _OTHER_CLOCK_NS:
+        delay = int(np.median(np.array(states.delays)))
+        if not _OTHER_CLOCK_NS <= abs(delay) < TIME_LIMIT_NS // 2:
             return 0
         self.tally.note(
             f"log times are {delay / 1e9:g} s ahead of the stamps of the joint states; "
@@ -408,36 +449,35 @@ class _Bag:
         return delay
 
     def _signals(self, names: tuple[str, ...], shift: int, keep_invalid: bool) -> dict[str, Signal]:
-        for topic, states in self.joint_topics.items():
-            self._joint_signals(topic, states, names)
         declared = {entry["topic"]: (name, entry) for name, entry in self.session["signals"].items()}
         known = {topic: (name, unit) for name, (topic, unit) in topics.NUMBER_SIGNALS.items()}
         signals: dict[str, Signal] = {}
+
+        def add(name: str, times: IntArray, value: FloatArray, places: IntArray, unit: str) -> None:
+            if name in self.session["signals"]:
+                unit = self.session["signals"][name]["unit"]
+            good = np.abs(times) < TIME_LIMIT_NS
+            self.tally.add(BAD_TIME, places[~good].tolist())
+            if not keep_invalid:
+                good &= screen_signal(name, value, places, self.tally)
+            signals[name] = Signal(times[good], value[good], unit)
+
+        for topic, states in self.joint_topics.items():
+            for name, unit, rows, value in self._joint_signals(topic, states, names):
+                add(name, states.times[rows], value, states.places[rows], unit)
         for key, values in self.values.items():
             name, unit = known.get(key, (key.removeprefix("/"), values.unit))
-            width = Counter(map(len, values.blocks)).most_common(1)[0][0]
-            columns = None if values.scalar else width // 8
+            counts = values.numbers.counts
+            columns = None if values.scalar else int(np.bincount(counts).argmax())
             if key in declared:
-                name, entry = declared[key]
-                unit, columns = entry["unit"], entry["columns"]
-                width = 8 * (1 if columns is None else columns)
-            elif name in self.session["signals"]:
-                unit = self.session["signals"][name]["unit"]
-            fits = np.array([len(block) == width for block in values.blocks])
-            places = np.array(values.places, dtype=np.int64)
-            self.tally.add(f"signal {name}: wrong number of values", places[~fits].tolist())
-            times = np.array(values.times, dtype=np.int64)[fits]
-            if not values.stamped:
-                times = times - shift
-            block = b"".join(b for b in values.blocks if len(b) == width)
+                name, columns = declared[key][0], declared[key][1]["columns"]
+            fits = counts == (1 if columns is None else columns)
+            self.tally.add(f"signal {name}: wrong number of values", values.places[~fits].tolist())
+            rows = np.flatnonzero(fits)
+            value = values.numbers.take(rows, np.arange(1 if columns is None else columns))
+            times = values.times[rows] - (0 if values.stamped else shift)
             name = key if name in signals else name
-            value = np.frombuffer(block, dtype="<f8").reshape(
-                (len(times),) if columns is None else (len(times), columns)
-            )
-            if not keep_invalid:
-                good = screen_signal(name, value, places[fits], self.tally)
-                times, value = times[good], value[good]
-            signals[name] = Signal(times, value, unit)
+            add(name, times, value[:, 0] if columns is None else value, values.places[rows], unit)
         for name, entry in self.session["signals"].items():
             if name not in signals:
                 columns = entry["columns"]
@@ -445,31 +485,27 @@ class _Bag:
                 signals[name] = Signal(np.empty(0, dtype=np.int64), empty, entry["unit"])
         return signals
 
-    def _joint_signals(self, topic: str, states: _JointTopic, names: tuple[str, ...]) -> None:
-        """Turn the fields of a further JointState topic into signals."""
-        if not states.times:
+    def _joint_signals(
+        self, topic: str, states: _JointTopic, names: tuple[str, ...]
+    ) -> Iterator[tuple[str, str, IntArray, FloatArray]]:
+        """Name, unit, messages (R,) and values (R,k) of every field of a further JointState topic."""
+        if not len(states):
             return
-        rows = states.rows(names)
+        rows = states.having(names)
         if not len(rows):
-            names = Counter(states.names).most_common(1)[0][0]
-            if len(set(names)) < len(names) or not names:
-                self.unread[topic, JOINT_STATE] += len(states.times)
+            names = max(states.names, key=lambda names: len(states.of(names)))
+            if not names or len(set(names)) < len(names):
+                self.unread[topic, JOINT_STATE] += len(states)
                 return
-            rows = states.rows(names)
-        if others := len(states.times) - len(rows):
+            rows = states.having(names)
+        if others := len(states) - len(rows):
             self.tally.note(f"not read: {others} messages of other joints on {topic}")
         own = {(t, field): (name, unit) for name, (t, field, unit) in topics.JOINT_SIGNALS.items()}
         for k, field in enumerate(_FIELDS):
-            value, there = states.array(k, rows, names)
+            value, there = states.values(k, rows, names)
             if there.any():
                 name, unit = own.get((topic, field), (f"{topic.removeprefix('/')}/{field}", ""))
-                signal = self.values[name] = _Values(unit)
-                size = 8 * len(names)
-                block = value.astype("<f8").tobytes()
-                for r, has in enumerate(there.tolist()):
-                    if has:
-                        row = int(rows[r])
-                        signal.add(states.times[row], states.places[row], block[r * size : (r + 1) * size])
+                yield name, unit, rows[there], value[there]
 
 
 def _event(time_ns: int, text: str) -> Event:

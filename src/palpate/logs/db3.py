@@ -85,7 +85,7 @@ class Db3Reader:
                         yield Message(channels[number], time_ns, data)
                     elif len(self.problems) < 8:
                         self.problems.append(f"message {count + 1} is damaged")
-        except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
+        except (sqlite3.Error, OverflowError, UnicodeDecodeError, MemoryError) as error:
             if count == 0:
                 raise LogError(f"{self.path}: not a readable rosbag2 database: {error}") from None
             self.problems.append(f"damaged behind message {count}: {error}")

@@ -130,7 +130,7 @@ class McapReader:
             self._problem("the file has no end: the recording was interrupted or the file cut")
             return
         start, _, checksum = struct.unpack_from("<QQI", footer, 9)
-        if not len(MAGIC) <= start <= self.size - tail:
+        if not len(MAGIC) <= start <= self.size - tail or self.size - start > RECORD_LIMIT:
             return
         file.seek(start)
         summary = file.read(self.size - tail - start)

@@ -22,6 +22,7 @@ from palpate.logs.log import Event, Log, Signal
 from palpate.logs.repair import (
     BAD_TIME,
     TIME_LIMIT_NS,
+    BoolArray,
     FloatArray,
     IntArray,
     Tally,
@@ -279,7 +280,7 @@ def _log(
     )
 
 
-def _ns(time: npt.NDArray[Any], exponent: int, path: Path) -> tuple[IntArray, npt.NDArray[np.bool_]]:
+def _ns(time: npt.NDArray[Any], exponent: int, path: Path) -> tuple[IntArray, BoolArray]:
     """Times as integer nanoseconds, and which of them are any good. Integers are exact, floats rounded."""
     if time.dtype.kind in "iu":
         factor = 10**exponent

@@ -10,7 +10,6 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal
@@ -44,8 +43,7 @@ if TYPE_CHECKING:
     from palpate.logs.log import Log
     from palpate.logs.mcap import McapWriter
 
-#: names of ``palpate::Status`` by value, and the level each has in a DiagnosticStatus (0 ok, 1 warning, 2
-#: error)
+#: names of ``palpate::Status`` by value, and the level of each in a DiagnosticStatus: 0 ok, 1 warning, 2 error
 STATUS_LEVELS = {
     "ok": 0,
     "warming": 1,
@@ -118,6 +116,8 @@ class Recorder:
         self._shape = (self._n,)
         self._flush_s = flush_s
         self._encoder = JointStateEncoder(self.joint_names, frame_id)
+        # told with the next message, whose time it takes: a viewer's time line starts with the data
+        self._untold: dict[str, Any] = {"meta": _texts(session or {})}
         self._out = _create(self.path, storage, overwrite)
         self._channels: dict[str, tuple[int, str]] = {}
         self._signals: dict[str, dict[str, Any]] = {}
@@ -128,8 +128,6 @@ class Recorder:
         self._next_flush = 0.0
         self._open = True
         self._joint_states = self._channel(topics.JOINT_STATES, JOINT_STATE)
-        # told with the next message, whose time it takes: a viewer's time line starts with the data
-        self._untold: dict[str, Any] = {"meta": _texts(session or {})}
 
     # -- what can be recorded ---------------------------------------------------------------------------
 
@@ -151,13 +149,13 @@ class Recorder:
             model_torque: (n,) [N m]; None if there is none.
         """
         time_ns = self._time(time_ns)
+        q, e = self._vector(position, "position"), self._vector(effort, "effort")
         v = b"" if velocity is None else self._vector(velocity, "velocity")
-        message = self._encoder.encode(
-            time_ns, self._vector(position, "position"), v, self._vector(effort, "effort")
-        )
-        self._put(self._joint_states, time_ns, message)
-        if model_torque is not None:
-            self._efforts(topics.MODEL_TORQUE, time_ns, model_torque, "model_torque")
+        m = b"" if model_torque is None else self._vector(model_torque, "model_torque")
+        self._put(self._joint_states, time_ns, self._encoder.encode(time_ns, q, v, e))
+        if m:
+            channel = self._channel(topics.MODEL_TORQUE, JOINT_STATE)
+            self._put(channel, time_ns, self._encoder.encode(time_ns, b"", b"", m))
 
     def command(self, time_ns: int, effort: npt.ArrayLike) -> None:
         """Record the effort (n,) that was sent to the drives, in the driver's unit."""
@@ -503,6 +501,11 @@ def _clear(folder: Path, overwrite: bool) -> None:
 
 
 def _version() -> str:
+    from importlib.metadata import (
+        PackageNotFoundError,
+        version,
+    )  # takes as long to load as all of this package
+
     try:
         return version("palpate")
     except PackageNotFoundError:

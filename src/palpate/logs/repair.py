@@ -20,6 +20,7 @@ from palpate.errors import LogError
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
 
 POSITION_LIMIT = 1e6  #: a larger |position| [rad or m] is no measurement
 VALUE_LIMIT = 1e9  #: a larger |value| of any other quantity is no measurement
@@ -166,7 +167,7 @@ def screen(
     *,
     keep_invalid: bool,
     garbage: Any = None,
-) -> npt.NDArray[np.bool_]:
+) -> BoolArray:
     """Rows to keep.
 
     A quantity other than the position that is NaN in every row was not recorded: it is taken out of
@@ -206,10 +207,10 @@ def screen(
     return np.ones(n, dtype=bool) if keep_invalid else ~(text | bad | absurd)
 
 
-def screen_signal(name: str, value: FloatArray, places: IntArray, tally: Tally) -> npt.NDArray[np.bool_]:
+def screen_signal(name: str, value: FloatArray, places: IntArray, tally: Tally) -> BoolArray:
     """Which values (M,) or (M,k) of a signal to keep, as a mask (M,); the others are counted under its name."""
     within = np.abs(value) <= VALUE_LIMIT  # False for NaN, too
-    good: npt.NDArray[np.bool_] = within if value.ndim == 1 else np.asarray(within.all(axis=1))
+    good: BoolArray = within if value.ndim == 1 else np.asarray(within.all(axis=1))
     tally.add(f"signal {name}: NaN, infinite or beyond 1e9", places[~good].tolist())
     return good
 

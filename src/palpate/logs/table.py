@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import numpy.typing as npt
 
 from palpate.errors import LogError
 from palpate.logs.columns import TIME_UNITS, ColumnMap, Layout, conventional, resolve
@@ -23,6 +22,7 @@ from palpate.logs.repair import (
     CUT_LINE,
     TIME_LIMIT_NS,
     WRONG_COLUMNS,
+    BoolArray,
     FloatArray,
     IntArray,
     Tally,
@@ -208,7 +208,7 @@ class _Table:
         self.used: list[int] = []
         self.times: list[IntArray] = []
         self.values: list[FloatArray] = []
-        self.garbage: list[npt.NDArray[np.bool_]] = []
+        self.garbage: list[BoolArray] = []
         self.places: list[IntArray] = []
 
     def read(self, blocks: Iterator[tuple[int, list[str]]]) -> Log:
@@ -252,9 +252,8 @@ class _Table:
         self.width = Counter(map(len, sample)).most_common(1)[0][0] if sample else len(first)
         if header is not None and self.width != len(header):
             ends = {cells[-1].strip() for cells in sample if len(cells) == self.width}
-            if self.width != len(header) + 1 or ends != {
-                ""
-            }:  # a delimiter behind the last value does no harm
+            # a delimiter behind the last value does no harm
+            if self.width != len(header) + 1 or ends != {""}:
                 raise LogError(
                     f"{self.path}: the header names {len(header)} columns, but the rows have {self.width} "
                     f"(separated by {self.delimiter!r})"
@@ -315,7 +314,7 @@ class _Table:
         delimiter = self.delimiter
         return [exact_ns(line.split(delimiter, column + 1)[column], exponent) for line in lines]
 
-    def _parse(self, lines: list[str]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    def _parse(self, lines: list[str]) -> tuple[FloatArray, BoolArray]:
         """Values (R,c) of the used columns; cells that are no number are NaN and marked."""
         try:
             values = np.loadtxt(lines, delimiter=self.delimiter, usecols=self.used, comments=None, ndmin=2)
@@ -327,7 +326,7 @@ class _Table:
             return self._parse_cells([self._cells(line) for line in lines])
         return values, np.zeros(values.shape, dtype=bool)
 
-    def _parse_cells(self, rows: list[list[str]]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    def _parse_cells(self, rows: list[list[str]]) -> tuple[FloatArray, BoolArray]:
         shape = (len(rows), len(self.used))
         cells = [number(row[i]) for row in rows for i in self.used]
         garbage = np.array([cell is None for cell in cells], dtype=bool).reshape(shape)
