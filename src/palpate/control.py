@@ -107,9 +107,7 @@ class Controller:
             raise InputError(str(e)) from None
         self._nothing = Load()
 
-    def step(
-        self, setpoint: Setpoint, q: Array, dq: Array, load: Load | None = None
-    ) -> tuple[Array, Status]:
+    def step(self, setpoint: Setpoint, q: Array, dq: Array, load: Load | None = None) -> tuple[Array, Status]:
         """Torque [N m] and status (saturated, non_finite) for the estimated state q, dq and what is held."""
         torque, status = self._core.step(
             setpoint.q, setpoint.dq, setpoint.ddq, q, dq, self._nothing if load is None else load

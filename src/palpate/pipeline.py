@@ -1,4 +1,4 @@
-"""The pipeline: samples in, what the arm holds and what pushes it out. The C++ core does the work; nothing is computed here."""
+"""The pipeline: samples in, what the arm holds and what pushes it out; computed by the C++ core, nothing here."""
 
 from __future__ import annotations
 
@@ -85,7 +85,10 @@ class Payload:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """Everything known after a sample; of one sample, or one row per sample. Only status ``ok`` means: use the number."""
+    """Everything known after a sample; of one sample, or one row per sample.
+
+    Only status ``ok`` means: use the number.
+    """
 
     time_ns: Any
     """int or (N,) int64 [ns]"""
@@ -290,7 +293,9 @@ def tare(arm: Arm, log: Log, *, mass_std: float = 0.2) -> Tare:
     except ValueError as e:
         raise InputError(str(e)) from None
     if used < 100:
-        raise InputError(f"tare: only {used} of {len(log)} samples can be used; a tare needs some seconds of motion")
+        raise InputError(
+            f"tare: only {used} of {len(log)} samples can be used; a tare needs some seconds of motion"
+        )
     joints = tuple(
         joint.replace(mass=joint.mass * s, inertia=joint.inertia * s)
         for joint, s in zip(arm.joints, factors, strict=True)

@@ -151,7 +151,8 @@ def svg(figure: Figure, label: str, prefix: str) -> str:
 def _shorter_path(match: re.Match[str]) -> str:
     """Hundredths of a point are enough, and blanks beside letters are not needed."""
     path = re.sub(r"-?\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}".rstrip("0").rstrip("."), match[1])
-    return f' d="{re.sub(r" ?[\s]*([MLCQZz])[\s]*", r"\1", path).strip()}"'
+    path = re.sub(r"\s*([MLCQZz])\s*", r"\1", path).strip()
+    return f' d="{path}"'
 
 
 _VARIABLE = {colour: f"var(--{name})" for name, colour in LIGHT.items()} | {"#000000": "var(--ink)"}

@@ -1,0 +1,37 @@
+"""Reports and figures: self-contained HTML, Markdown, JSON, PNG. Figures need ``palpate[report]``."""
+
+from __future__ import annotations
+
+from ._style import encode_png
+from .figures import (
+    coverage_figure,
+    error_figure,
+    hero_picture,
+    joints_figure,
+    mass_figure,
+    save_png,
+    table_figure,
+    torque_figure,
+)
+from .study import StudyFiles, StudyRow, markdown_table, update_markdown, write_study
+from .weigh import write_weigh_report
+from .weighing import WeighReport
+
+__all__ = [
+    "StudyFiles",
+    "StudyRow",
+    "WeighReport",
+    "coverage_figure",
+    "encode_png",
+    "error_figure",
+    "hero_picture",
+    "joints_figure",
+    "markdown_table",
+    "mass_figure",
+    "save_png",
+    "table_figure",
+    "torque_figure",
+    "update_markdown",
+    "write_study",
+    "write_weigh_report",
+]
