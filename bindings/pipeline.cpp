@@ -159,7 +159,9 @@ void bind_pipeline(nb::module_& m) {
                                    {"lever", &JointFormulaConfig::lever, "axis to load [m]; nan: to the grasp point"},
                                    {"gravity", &JointFormulaConfig::gravity, "[m/s^2]; nan: the arm's"},
                                    {"sin_threshold", &JointFormulaConfig::sin_threshold, "smallest |sin theta| [1]"},
-                                   {"speed_threshold", &JointFormulaConfig::speed_threshold, "largest ||q'|| [rad/s]"}});
+                                   {"speed_threshold", &JointFormulaConfig::speed_threshold, "largest ||q'|| [rad/s]"},
+                                   {"ok_relative", &JointFormulaConfig::ok_relative, "status ok below this part of the mass [1]"},
+                                   {"ok_absolute", &JointFormulaConfig::ok_absolute, "or below this [kg]"}});
   bind_config<RegressionConfig>(m, "Regression", "Recursive least squares of the load on tau_ext of all joints, with friction biases (MATH.md section 4).",
                                 {{"first_moment", &RegressionConfig::first_moment, "estimate m and m (c - grasp)"},
                                  {"mass_prior_std", &RegressionConfig::mass_prior_std, "[kg]"},

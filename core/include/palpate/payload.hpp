@@ -14,6 +14,8 @@ struct JointFormulaConfig {
   double gravity = std::numeric_limits<double>::quiet_NaN();  ///< [m/s^2]; NaN: the arm's
   double sin_threshold = 0.2;     ///< the load must stand out at least so far sideways, sin theta [1]
   double speed_threshold = 0.5;   ///< ||q'|| above this is motion, not weighing [rad/s]
+  double ok_relative = 0.25;      ///< status `ok` once mass_std is below the larger of this part of the mass
+  double ok_absolute = 0.05;      ///< and this [kg]
 };
 
 /// R eq. (8), m = -tau_6/(g l_4 sin theta), for any joint i and any mount:  m = tau_ext,i / (J_c,i^T g),  c the grasp point,
@@ -25,6 +27,8 @@ class JointFormula {
     check::in_range("JointFormulaConfig joint", config.joint, -1, arm.n() - 1);
     check::positive("JointFormulaConfig sin_threshold [1]", config.sin_threshold);
     check::positive("JointFormulaConfig speed_threshold [rad/s]", config.speed_threshold);
+    check::positive("JointFormulaConfig ok_relative [1]", config.ok_relative);
+    check::positive("JointFormulaConfig ok_absolute [kg]", config.ok_absolute);
     if (!std::isnan(config.lever)) check::positive("JointFormulaConfig lever [m]", config.lever);
     if (!std::isnan(config.gravity)) check::positive("JointFormulaConfig gravity [m/s^2]", config.gravity);
     const Vec3<double> g = arm.gravity();
@@ -50,6 +54,8 @@ class JointFormula {
         last_.mass = external.torque[detail::at(j)] / arm_of_force;
         last_.mass_std = external.std[detail::at(j)] / std::abs(arm_of_force);
         last_.status = external.status;
+        const bool sure = last_.mass_std <= std::max(config_.ok_relative * std::abs(last_.mass), config_.ok_absolute);
+        if (external.status == Status::ok && !sure) last_.status = Status::warming;
         return last_;
       }
       if (config_.joint >= 0) break;

@@ -52,12 +52,14 @@ def mass_unit(values: Iterable[float]) -> tuple[float, str]:
 
 
 def rounded(value: float, spread: float) -> tuple[str, str]:
-    """A value and its spread to the digits the spread allows: two significant ones of the spread."""
+    """A value and its spread to the digits the spread allows: two significant ones of a spread 1x or 2x, else one."""
     if not math.isfinite(value):
         return "–", "–"
     if not math.isfinite(spread) or spread <= 0.0:
         return number(value), "0" if spread == 0.0 else "?"
-    decimals = min(max(1 - math.floor(math.log10(spread)), 0), 9)
+    exponent = math.floor(math.log10(spread))
+    digits = 1 if spread / 10.0**exponent < 2.95 else 0
+    decimals = min(max(digits - exponent, 0), 9)
     return f"{value:.{decimals}f}".replace("-", "−"), f"{spread:.{decimals}f}"
 
 

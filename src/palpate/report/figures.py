@@ -189,15 +189,15 @@ def _ribbon(ax: Axes, spans: Sequence[tuple[float, float, int]], width: float) -
 
 def _mass_range(report: WeighReport, factor: float) -> tuple[float, float]:
     """What the vertical axis shows: zero, the truth, and the estimates without their first wild moments."""
-    ok = np.asarray(report.payload_status) == 0
+    ok = report.status == 0
     values: list[float] = [0.0]
-    for curve, used in ((np.asarray(report.mass), ok), *((np.asarray(v), ok) for v in report.others.values())):
+    for curve, used in ((report.mass, ok), *((v, ok) for v in report.others.values())):
         finite = np.isfinite(curve)
         chosen = curve[finite & used] if (finite & used).any() else curve[finite]
         if chosen.size:
             values.extend(float(p) for p in np.percentile(chosen, (0.5, 99.5)))
-    values.extend(float(v) for v in np.asarray(report.truth_mass) if math.isfinite(v))
-    headline, std = float(report.headline_mass), float(report.headline_std)  # type: ignore[arg-type]
+    values.extend(float(v) for v in report.truth[1] if math.isfinite(v))
+    headline, std = report.headline.mass, report.headline.std
     if math.isfinite(headline):
         values.append(headline)
         if math.isfinite(std) and std < abs(headline):
@@ -209,9 +209,9 @@ def _mass_range(report: WeighReport, factor: float) -> tuple[float, float]:
 
 def _truth_steps(report: WeighReport) -> tuple[Array, Array]:
     """The truth as corners of a staircase within the samples' time."""
-    time = np.asarray(report.time_s)
+    time = report.time_s
     low, high = float(time.min()), float(time.max())
-    steps = np.asarray(report.truth_time_s)
+    steps = report.truth[0]
     corners = np.concatenate(([low], steps[(steps > low) & (steps < high)], [high]))
     return corners, report.truth_at(corners)
 
@@ -228,14 +228,14 @@ def mass_figure(report: WeighReport, *, narrow: bool = False) -> Figure:
     """
     with drawing():
         points = MASS_POINTS // 3 if narrow else MASS_POINTS
-        close_up = len(np.asarray(report.time_s)) >= 20 and math.isfinite(float(report.headline_mass))  # type: ignore[arg-type]
+        close_up = len(report.time_s) >= 20 and math.isfinite(report.headline.mass)
         width = 3.25 if narrow else (5.45 if close_up else 8.4)
         figure = _figure(4.0 if narrow else 10.4, (5.4 if close_up else 3.2) if narrow else 3.7)
         bottom = 2.75 if narrow and close_up else 0.62
         main = _axes(figure, 0.62, bottom, width, 2.35 if narrow else 2.8)
         strip = _axes(figure, 0.62, bottom - 0.2, width, 0.16, sharex=main)
         factor, unit = _draw_mass(main, report, points, labels=not narrow)
-        spans = _series.spans(np.asarray(report.time_s), np.asarray(report.payload_status))
+        spans = _series.spans(report.time_s, report.status)
         _ribbon(strip, spans, width)
         _ticks(main, 6 if narrow else 9, 6)
         main.tick_params(bottom=False, labelbottom=False)
@@ -248,12 +248,12 @@ def mass_figure(report: WeighReport, *, narrow: bool = False) -> Figure:
 
 def _draw_mass(ax: Axes, report: WeighReport, points: int, *, labels: bool) -> tuple[float, str]:
     """Everything of the mass over the whole time; returns the unit's factor and name."""
-    time, mass, std = (np.asarray(a) for a in (report.time_s, report.mass, report.mass_std))
-    factor, unit = mass_unit([float(report.headline_mass), *np.asarray(report.truth_mass).tolist()])  # type: ignore[arg-type]
+    time, mass, std = report.time_s, report.mass, report.std
+    factor, unit = mass_unit([report.headline.mass, *report.truth[1].tolist()])
     ax.set_ylim(*_mass_range(report, factor))
     _time_limits(ax, time)
     ax.set_ylabel(f"mass [{unit}]")
-    _shade(ax, _series.spans(time, np.asarray(report.payload_status)))
+    _shade(ax, _series.spans(time, report.status))
     # drawn beyond the picture a band of kilometres would only cost digits
     low, high = ax.get_ylim()
     far = 5.0 * (high - low)
@@ -277,7 +277,7 @@ def _draw_mass(ax: Axes, report: WeighReport, points: int, *, labels: bool) -> t
             ends.append((float(y[finite[-1]]) * factor, name, style["color"]))
 
     for index, (name, other) in enumerate(report.others.items()):
-        curve(np.asarray(other), name, **line_style("", index))
+        curve(other, name, **line_style("", index))
     curve(mass, "palpate ± 95 %" if np.isfinite(std).any() else "palpate", color=LIGHT["blue"], linewidth=1.5)
     if report.truth_known:
         corners, values = _truth_steps(report)
@@ -303,9 +303,9 @@ def _draw_close_up(
 ) -> None:
     """The settled part, so near that the band has a width."""
     begin, end = report.settled
-    time, mass, std = (np.asarray(a) for a in (report.time_s, report.mass, report.mass_std))
+    time, mass, std = report.time_s, report.mass, report.std
     shown = (time >= begin) & (time <= end)
-    headline = float(report.headline_mass)  # type: ignore[arg-type]
+    headline = report.headline.mass
     deviations = [np.abs(mass[shown] - headline), 1.5 * TWO_SIDED_95 * std[shown]]
     deviations.append(np.abs(report.truth_at(time[shown]) - headline))
     spread = np.concatenate(deviations)
@@ -324,7 +324,7 @@ def _draw_close_up(
         color=LIGHT["blue"],
     )
     for index, other in enumerate(report.others.values()):
-        _line(ax, time[shown], np.asarray(other)[shown] * factor, points // 2, **line_style("", index))
+        _line(ax, time[shown], other[shown] * factor, points // 2, **line_style("", index))
     _line(ax, time[shown], mass[shown] * factor, points // 2, color=LIGHT["blue"], linewidth=1.5)
     truth = report.truth_at(time[shown]) * factor
     if np.isfinite(truth).any():
@@ -538,9 +538,9 @@ def torque_figure(
 
 def normalised_error(report: WeighReport) -> Array:
     """(N,) error of the mass in its own standard deviations; NaN where status is not ok or truth is unknown."""
-    mass, std = np.asarray(report.mass), np.asarray(report.mass_std)
+    mass, std = report.mass, report.std
     error = mass - report.truth_at(report.time_s)
-    usable = (np.asarray(report.payload_status) == 0) & np.isfinite(error) & np.isfinite(std) & (std > 0.0)
+    usable = (report.status == 0) & np.isfinite(error) & np.isfinite(std) & (std > 0.0)
     return np.divide(error, std, out=np.full(len(mass), np.nan), where=usable)
 
 
@@ -557,7 +557,7 @@ def error_figure(report: WeighReport, *, narrow: bool = False) -> Figure:
     with drawing():
         figure = _figure(4.0, 2.0) if narrow else _figure(10.4, 2.1)
         ax = _axes(figure, 0.62, 0.45, 3.25 if narrow else 8.4, 1.45 if narrow else 1.55)
-        time = np.asarray(report.time_s)
+        time = report.time_s
         _time_limits(ax, time)
         ax.set_ylim(-6.3, 6.3)
         ax.axhspan(-TWO_SIDED_95, TWO_SIDED_95, color=LIGHT["blue"], alpha=0.14, linewidth=0.0)
@@ -672,7 +672,7 @@ def table_figure(rows: Sequence[StudyRow], *, title: str = "") -> Figure:
             for column, ((x, align, limit), text) in enumerate(zip(places, cells, strict=True)):
                 colour = LIGHT["muted"] if line == 0 else LIGHT["ink"]
                 if line and column == 4:
-                    colour = {True: LIGHT["green"], False: LIGHT["red"]}.get(rows[line - 1].ok, LIGHT["muted"])  # type: ignore[arg-type]
+                    colour = {True: LIGHT["green"], False: LIGHT["red"]}.get(rows[line - 1].ok, LIGHT["muted"])
                 ax.text(x, y, clean(text, limit), ha=align, va="center", color=colour, fontsize=8.5, parse_math=False)
             y += 0.16
             ax.plot([0.0, 8.6], [y, y], color=LIGHT["grid"], linewidth=0.7)
@@ -727,9 +727,9 @@ def _draw_hero(figure: Figure, report: WeighReport) -> None:
     ink, muted = LIGHT["ink"], LIGHT["muted"]
     large = {"font.size": 16.0, "xtick.labelsize": 15.0, "ytick.labelsize": 15.0, "axes.labelsize": 16.0}
     with matplotlib.rc_context(large):
-        mass, std = float(report.headline_mass), float(report.headline_std)  # type: ignore[arg-type]
-        truth = float(report.truth_at(report.headline_time_s))  # type: ignore[arg-type]
-        factor, unit = mass_unit([mass, *np.asarray(report.truth_mass).tolist()])
+        mass, std = report.headline.mass, report.headline.std
+        truth = report.headline.truth
+        factor, unit = mass_unit([mass, *report.truth[1].tolist()])
         value, half = rounded(mass * factor, TWO_SIDED_95 * std * factor)
         figure.text(7.0 / 16, 6.1 / 7, f"{value} {unit}", fontsize=44, fontweight="bold", color=LIGHT["blue"])
         words = [f"± {half} {unit} (95 %)"] if half != "?" else []

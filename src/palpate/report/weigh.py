@@ -43,7 +43,7 @@ def write_weigh_report(report: WeighReport, path: str | PathLike[str]) -> Path:
     """
     with drawing():
         sections = [_header(report), _card(report)]
-        if len(np.asarray(report.time_s)):
+        if len(report.time_s):
             sections += [_mass(report), _comparison(report), *_joints(report), _error(report)]
         if report.settings:
             sections.append(_page.section("Settings", _page.mapping_table(report.settings)))
@@ -59,7 +59,7 @@ def write_weigh_report(report: WeighReport, path: str | PathLike[str]) -> Path:
 
 
 def _header(report: WeighReport) -> str:
-    time = np.asarray(report.time_s)
+    time = report.time_s
     parts = [report.arm] if report.arm else []
     if len(time) > 1:
         spacing = float(np.median(np.diff(time)))
@@ -71,8 +71,8 @@ def _header(report: WeighReport) -> str:
 
 
 def _card(report: WeighReport) -> str:
-    mass, std = float(report.headline_mass), float(report.headline_std)  # type: ignore[arg-type]
-    status = status_text(report.headline_status)  # type: ignore[arg-type]
+    mass, std = report.headline.mass, report.headline.std
+    status = status_text(report.headline.status)
     factor, unit = mass_unit([mass])
     value, half = rounded(mass * factor, TWO_SIDED_95 * std * factor)
     spread = "" if half == "?" else f" <small>± {half} {unit}</small>"
@@ -83,7 +83,7 @@ def _card(report: WeighReport) -> str:
         + (
             ""
             if _at_end(report)
-            else f", known at {number(float(report.headline_time_s), 4)} s"  # type: ignore[arg-type]
+            else f", known at {number(report.headline.time_s, 4)} s"
         )
         + "</p>",
         f'<p><span class="pill" style="--tone:var(--{status.colour})">{escape(status.name)}</span>'
@@ -100,8 +100,8 @@ def _card(report: WeighReport) -> str:
 
 
 def _at_end(report: WeighReport) -> bool:
-    time = np.asarray(report.time_s)
-    return not len(time) or float(report.headline_time_s) >= float(time[-1])  # type: ignore[arg-type]
+    time = report.time_s
+    return not len(time) or report.headline.time_s >= float(time[-1])
 
 
 def _fact(name: str, value: str, more: str = "") -> str:
@@ -111,7 +111,7 @@ def _fact(name: str, value: str, more: str = "") -> str:
 
 def _facts(report: WeighReport, mass: float, std: float, factor: float, unit: str) -> list[str]:
     facts = []
-    truth = float(report.truth_at(report.headline_time_s))  # type: ignore[arg-type]
+    truth = report.headline.truth
     if math.isfinite(truth):
         facts.append(_fact("truth", f"{number(truth * factor)} {unit}"))
         error = mass - truth
@@ -145,7 +145,7 @@ def _both(build: Callable[[bool], Figure], label: str, prefix: str) -> str:
 
 def _mass(report: WeighReport) -> str:
     key = [("palpate", "blue", "line")]
-    if np.isfinite(np.asarray(report.mass_std)).any():
+    if np.isfinite(report.std).any():
         key.append(("95 % band", "blue", "area"))
     if report.truth_known:
         key.append(("truth", "ink", "dash"))
@@ -164,7 +164,7 @@ def _mass(report: WeighReport) -> str:
 
 def _statuses(report: WeighReport) -> str:
     """How often each status occurred, and what it means."""
-    status = np.asarray(report.payload_status)
+    status = report.status
     values, counts = np.unique(status, return_counts=True)
     parts = []
     for value, count in sorted(zip(values.tolist(), counts.tolist(), strict=True), key=lambda p: -p[1]):
@@ -179,27 +179,27 @@ def _comparison(report: WeighReport) -> str:
     """Every estimator at the same moment, if there is more than one or a truth to compare with."""
     if not report.others:
         return ""
-    time = np.asarray(report.time_s)
-    row = report.row_at(float(report.headline_time_s))  # type: ignore[arg-type]
+    time = report.time_s
+    row = report.row_at(report.headline.time_s)
     begin, end = report.settled
     shown = (time >= begin) & (time <= end)
     truth = report.truth_at(time)
     known = bool(np.isfinite(truth[shown]).any())
-    factor, unit = mass_unit([float(report.headline_mass), *np.asarray(report.truth_mass).tolist()])  # type: ignore[arg-type]
+    factor, unit = mass_unit([report.headline.mass, *report.truth[1].tolist()])
     rows = []
     for name, values in (("palpate", report.mass), *report.others.items()):
         series = np.asarray(values)
         mass = float(series[row]) if row is not None else math.nan
         cells = [escape(name), f"{number(mass * factor)} {unit}"]
         if known:
-            error = mass - float(report.truth_at(report.headline_time_s))  # type: ignore[arg-type]
+            error = mass - report.headline.truth
             settled = (series - truth)[shown]
             settled = settled[np.isfinite(settled)]
             rms = math.sqrt(float(np.mean(np.square(settled)))) if settled.size else math.nan
             cells.append(f"{_signed(error * factor, 3)} {unit}" if math.isfinite(error) else "–")
             cells.append(f"{number(rms * factor, 3)} {unit}")
         rows.append(cells)
-    head = ["estimator", f"mass at {number(float(report.headline_time_s))} s"]  # type: ignore[arg-type]
+    head = ["estimator", f"mass at {number(report.headline.time_s)} s"]
     if known:
         head += ["error then", f"rms error, {number(begin, 3)} to {number(end, 3)} s"]
     note = _page.read("Same samples, same moment. The last column covers the time of the close-up above.")
@@ -227,10 +227,10 @@ def _joints(report: WeighReport) -> list[str]:
         ("estimated", report.q_estimated, report.dq_estimated),
         ("desired", report.q_desired, report.dq_desired),
     ]
-    positions = {name: np.asarray(q) for name, q, _ in series if q is not None}
-    speeds = {name: np.asarray(dq) for name, _, dq in series if dq is not None}
-    torque = None if report.external_torque is None else np.asarray(report.external_torque)
-    effort = None if report.effort is None else np.asarray(report.effort)
+    positions = {name: q for name, q, _ in series if q is not None}
+    speeds = {name: dq for name, _, dq in series if dq is not None}
+    torque = report.external_torque
+    effort = report.effort
     n = len(report.joint_names)
     lines = n * (len(positions) + len(speeds) + 2 * (torque is not None) + (effort is not None))
     points = min(max(_POINTS // max(lines, 1), 120), 900)
@@ -266,7 +266,7 @@ def _joints(report: WeighReport) -> list[str]:
             notes: list[str] | None = notes,
         ) -> Figure:
             return joints_figure(
-                np.asarray(report.time_s),
+                report.time_s,
                 {name: v[:, j : j + 1] for name, v in curves.items()},
                 [report.joint_names[j]],
                 unit=_unit(report, j, *units),
@@ -302,11 +302,11 @@ def _tracking(curves: dict[str, Array], units: Sequence[str]) -> list[str] | Non
 
 
 def _torques(report: WeighReport, torque: Array, points: int) -> str:
-    std = None if report.external_torque_std is None else np.asarray(report.external_torque_std)
+    std = report.external_torque_std
 
     def build(j: int) -> Figure:
         return torque_figure(
-            np.asarray(report.time_s),
+            report.time_s,
             torque[:, j : j + 1],
             None if std is None else std[:, j : j + 1],
             [report.joint_names[j]],
@@ -331,7 +331,7 @@ def _torques(report: WeighReport, torque: Array, points: int) -> str:
 def _efforts(report: WeighReport, effort: Array, points: int) -> str:
     def build(j: int) -> Figure:
         return joints_figure(
-            np.asarray(report.time_s),
+            report.time_s,
             {"measured": effort[:, j : j + 1]},
             [report.joint_names[j]],
             unit=report.effort_unit,

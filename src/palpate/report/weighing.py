@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,14 +29,16 @@ _JOINT_SERIES = (
 )
 
 
-def _series(value: Any, shape: tuple[int, ...], what: str) -> Array:
-    """A read-only float64 copy of the stated shape; it may hold NaN."""
+def _series(value: Any, shape: tuple[int, ...] | None, what: str, *, low: float | None = None) -> Array:
+    """A read-only float64 copy of the stated shape (None: any); it may hold NaN but nothing below `low`."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{what} must be numbers of shape {shape}, got {value!r:.80}") from None
-    if array.shape != shape:
+        raise InputError(f"{what} must be numbers, got {value!r:.80}") from None
+    if shape is not None and array.shape != shape:
         raise InputError(f"{what} must have shape {shape}, got {array.shape}")
+    if low is not None and np.any(array < low):
+        raise InputError(f"{what} must be >= {low:g}, got {float(np.nanmin(array)):g}")
     array.setflags(write=False)
     return array
 
@@ -47,25 +50,42 @@ def _number(value: Any, what: str) -> float:
         raise InputError(f"{what} must be a number, got {value!r:.80}") from None
 
 
+class Headline(NamedTuple):
+    """The number in large type."""
+
+    time_s: float
+    """when it was known [s]"""
+    mass: float
+    """[kg]"""
+    std: float
+    """standard deviation [kg]; NaN where unknown"""
+    status: int
+    """palpate.Status value"""
+    truth: float
+    """true mass at that time [kg]; NaN where unknown"""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WeighReport:
     """One weighing: N samples of an arm with n joints. For a prismatic joint read m for rad and N for N m.
 
     Only the title, the time and the mass are needed; what is None is left out of the report. Values that are not
-    finite are shown as gaps. Text may come from anywhere: it is escaped.
+    finite are shown as gaps. Arrays are copied, made float64 and read-only; anything numpy understands may be given.
+    Text may come from anywhere: it is escaped.
 
     Raises:
-        InputError: an array has the wrong shape, time is not finite, or a standard deviation is negative.
+        InputError: an array has the wrong shape, time is not finite, a standard deviation is negative, or the times
+            of the truth do not ascend.
     """
 
     title: str
-    time_s: npt.ArrayLike
+    time_s: Array
     """(N,) time of each sample [s], finite; the order of the samples is kept"""
-    mass: npt.ArrayLike
+    mass: Array
     """(N,) estimated mass [kg]"""
-    mass_std: npt.ArrayLike | None = None
+    mass_std: Array | None = None
     """(N,) its standard deviation [kg]; NaN where unknown"""
-    payload_status: npt.ArrayLike | None = None
+    payload_status: npt.NDArray[np.uint8] | None = None
     """(N,) palpate.Status values of the mass; None: all ok"""
     arm: str = ""
     """name of the arm"""
@@ -80,35 +100,35 @@ class WeighReport:
     """its palpate.Status; None: as at that time"""
     time_to_2_percent_s: float | None = None
     """from taking the object until the estimate stays within 2 % of the truth [s]; inf: never; None: unknown"""
-    truth_mass: npt.ArrayLike | None = None
-    """true mass [kg], a number, or (K,) if truth_time_s is given"""
-    truth_time_s: npt.ArrayLike | None = None
+    truth_mass: Array | float | None = None
+    """true mass [kg]: one number, or (K,) if truth_time_s is given"""
+    truth_time_s: Array | None = None
     """(K,) times from which each true mass holds, ascending [s]; before the first the truth is unknown"""
-    changes: npt.ArrayLike = ()
+    changes: Array | Sequence[float] = ()
     """(C,) times at which the estimator found that an object was taken or released [s]"""
-    others: Mapping[str, npt.ArrayLike] = field(default_factory=dict)
+    others: Mapping[str, Array] = field(default_factory=dict)
     """masses of other estimators from the same samples, each (N,) [kg], by name"""
 
     joint_names: Sequence[str] = ()
     joint_kinds: Sequence[str] | None = None
     """"revolute" or "prismatic" for each joint; None: all revolute"""
-    q_measured: npt.ArrayLike | None = None
+    q_measured: Array | None = None
     """(N, n) encoder positions [rad]"""
-    q_desired: npt.ArrayLike | None = None
+    q_desired: Array | None = None
     """(N, n) [rad]"""
-    q_estimated: npt.ArrayLike | None = None
+    q_estimated: Array | None = None
     """(N, n) [rad]"""
-    dq_measured: npt.ArrayLike | None = None
+    dq_measured: Array | None = None
     """(N, n) [rad/s]"""
-    dq_desired: npt.ArrayLike | None = None
+    dq_desired: Array | None = None
     """(N, n) [rad/s]"""
-    dq_estimated: npt.ArrayLike | None = None
+    dq_estimated: Array | None = None
     """(N, n) [rad/s]"""
-    external_torque: npt.ArrayLike | None = None
+    external_torque: Array | None = None
     """(N, n) torque of the environment on the joints [N m], > 0 when it pushes the robot"""
-    external_torque_std: npt.ArrayLike | None = None
+    external_torque_std: Array | None = None
     """(N, n) its standard deviation [N m]"""
-    effort: npt.ArrayLike | None = None
+    effort: Array | None = None
     """(N, n) what the drives reported, in effort_unit"""
     effort_unit: str = "N m"
 
@@ -123,106 +143,125 @@ class WeighReport:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        time = np.array(self.time_s, dtype=np.float64)
+        time = _series(self.time_s, None, "time_s")
         if time.ndim != 1 or not np.all(np.isfinite(time)):
             raise InputError(f"time_s must be finite and of shape (N,), got shape {time.shape}")
-        time.setflags(write=False)
         put(self, "time_s", time)
-        rows = (len(time),)
+        rows = time.shape
         put(self, "mass", _series(self.mass, rows, "mass"))
-        std = np.full(rows, np.nan) if self.mass_std is None else self.mass_std
-        put(self, "mass_std", _series(std, rows, "mass_std"))
-        status = np.array(np.zeros(rows) if self.payload_status is None else self.payload_status)
-        if status.shape != rows or (status.size and not np.all((status >= 0) & (status <= 255))):
-            raise InputError(f"payload_status must hold {rows[0]} numbers of 0 to 255, got shape {status.shape}")
-        status = status.astype(np.uint8)
-        status.setflags(write=False)
-        put(self, "payload_status", status)
+        if self.mass_std is not None:
+            put(self, "mass_std", _series(self.mass_std, rows, "mass_std", low=0.0))
+        if self.payload_status is not None:
+            status = _series(self.payload_status, rows, "payload_status")
+            if not np.all((status >= 0.0) & (status <= 255.0)):
+                raise InputError("payload_status must hold numbers of 0 to 255")
+            values = status.astype(np.uint8)
+            values.setflags(write=False)
+            put(self, "payload_status", values)
 
         names = tuple(str(name) for name in self.joint_names)
         put(self, "joint_names", names)
-        kinds = ("revolute",) * len(names) if self.joint_kinds is None else tuple(self.joint_kinds)
-        if len(kinds) != len(names) or not set(kinds) <= {"revolute", "prismatic"}:
-            raise InputError(
-                f"joint_kinds must be revolute or prismatic for each of {len(names)} joints, got {kinds!r:.200}"
-            )
-        put(self, "joint_kinds", kinds)
+        if self.joint_kinds is not None:
+            kinds = tuple(self.joint_kinds)
+            if len(kinds) != len(names) or not set(kinds) <= {"revolute", "prismatic"}:
+                raise InputError(
+                    f"joint_kinds must be revolute or prismatic for each of {len(names)} joints, got {kinds!r:.200}"
+                )
+            put(self, "joint_kinds", kinds)
         for what in _JOINT_SERIES:
             value = getattr(self, what)
             if value is not None:
-                put(self, what, _series(value, (*rows, len(names)), what))
-        for what in ("mass_std", "external_torque_std"):
-            value = getattr(self, what)
-            if value is not None and np.any(value < 0.0):
-                raise InputError(f"{what} must not be negative")
+                low = 0.0 if what.endswith("_std") else None
+                put(self, what, _series(value, (*rows, len(names)), what, low=low))
 
-        if (self.truth_time_s is None) != (self.truth_mass is None or np.ndim(self.truth_mass) == 0):
-            raise InputError("truth_mass is one number, or several with as many truth_time_s")
-        if self.truth_time_s is None:
-            put(self, "truth_time_s", np.array([-math.inf] if self.truth_mass is not None else []))
-            put(self, "truth_mass", np.atleast_1d([] if self.truth_mass is None else self.truth_mass))
-        else:
-            put(self, "truth_time_s", _series(self.truth_time_s, np.shape(self.truth_mass), "truth_time_s"))
-        put(self, "truth_mass", _series(self.truth_mass, np.shape(self.truth_time_s), "truth_mass"))
-        if np.ndim(self.truth_mass) != 1 or np.any(np.diff(np.asarray(self.truth_time_s)[1:]) < 0.0):
-            raise InputError("truth_time_s must be ascending and of shape (K,)")
-        put(self, "changes", _series(np.ravel(np.asarray(self.changes)), (np.size(self.changes),), "changes"))
+        if self.truth_time_s is not None:
+            times = _series(self.truth_time_s, None, "truth_time_s")
+            if times.ndim != 1 or np.any(np.diff(times) < 0.0) or np.any(np.isnan(times)):
+                raise InputError(f"truth_time_s must ascend and have shape (K,), got shape {times.shape}")
+            put(self, "truth_time_s", times)
+            put(self, "truth_mass", _series(self.truth_mass, times.shape, "truth_mass"))
+        elif self.truth_mass is not None:
+            put(self, "truth_mass", _number(self.truth_mass, "truth_mass (without truth_time_s)"))
+        changes = _series(self.changes, None, "changes").ravel()
+        put(self, "changes", changes)
         others = {str(k): _series(v, rows, f"others[{k!r:.80}]") for k, v in self.others.items()}
         put(self, "others", MappingProxyType(others))
         put(self, "settings", MappingProxyType(dict(self.settings)))
         put(self, "repair", tuple(self.repair))
         put(self, "provenance", tuple(self.provenance))
-
-        end = float(time[-1]) if len(time) else math.nan
-        at = end if self.headline_time_s is None else _number(self.headline_time_s, "headline_time_s")
-        put(self, "headline_time_s", at)
-        row = self.row_at(at)
-        for what, series in (("headline_mass", "mass"), ("headline_std", "mass_std")):
+        for what in ("headline_time_s", "headline_mass", "headline_std", "time_to_2_percent_s"):
             value = getattr(self, what)
-            if value is None:
-                value = math.nan if row is None else getattr(self, series)[row]
-            put(self, what, _number(value, what))
-        if self.headline_status is None:
-            put(self, "headline_status", 1 if row is None else int(status[row]))
-        else:
+            if value is not None:
+                put(self, what, _number(value, what))
+        if self.headline_status is not None:
             put(self, "headline_status", int(self.headline_status))
-        if self.time_to_2_percent_s is not None:
-            put(self, "time_to_2_percent_s", _number(self.time_to_2_percent_s, "time_to_2_percent_s"))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        raw = {f.name: getattr(self, f.name) for f in fields(self)}
-        raw.update(others=dict(self.others), settings=dict(self.settings))
-        return _restore, (raw,)
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name, value in given.items():
+            if isinstance(value, MappingProxyType):  # cannot be pickled
+                given[name] = dict(value)
+        return partial(type(self), **given), ()
 
-    def row_at(self, time_s: float) -> int | None:
-        """Index of the last sample at or before a time, of the first if there is none; None without samples."""
-        time = np.asarray(self.time_s)
-        if not len(time):
-            return None
-        before = np.flatnonzero(time <= time_s)
-        return int(before[-1]) if before.size else 0
+    @property
+    def status(self) -> npt.NDArray[np.uint8]:
+        """(N,) status of every sample."""
+        return np.zeros(self.time_s.shape, np.uint8) if self.payload_status is None else self.payload_status
+
+    @property
+    def std(self) -> Array:
+        """(N,) standard deviation of the mass [kg]; NaN where unknown."""
+        return np.full(self.time_s.shape, np.nan) if self.mass_std is None else self.mass_std
+
+    @property
+    def truth(self) -> tuple[Array, Array]:
+        """Times [s] from which true masses hold, and these [kg]; (K,) each, K = 0 if nothing is known."""
+        if self.truth_mass is None:
+            return np.empty(0), np.empty(0)
+        if self.truth_time_s is None:
+            return np.array([-math.inf]), np.array([self.truth_mass])
+        return self.truth_time_s, np.asarray(self.truth_mass)
 
     def truth_at(self, time_s: npt.ArrayLike) -> Array:
         """True mass [kg] at times of any shape; NaN where it is unknown."""
-        times, masses = np.asarray(self.truth_time_s), np.asarray(self.truth_mass)
+        times, masses = self.truth
         index = np.searchsorted(times, np.asarray(time_s, dtype=np.float64), side="right")
         return np.concatenate(([np.nan], masses))[index]
 
+    def row_at(self, time_s: float) -> int | None:
+        """Index of the last sample at or before a time, of the first if there is none; None without samples."""
+        if not len(self.time_s):
+            return None
+        before = np.flatnonzero(self.time_s <= time_s)
+        return int(before[-1]) if before.size else 0
+
     @property
-    def truth_known(self) -> bool:
-        """True if the true mass is known at some sample."""
-        return bool(np.any(np.isfinite(self.truth_at(self.time_s))))
+    def headline(self) -> Headline:
+        """The number in large type; without samples NaN with status warming, unless it was given."""
+        time = self.headline_time_s
+        if time is None:
+            time = float(self.time_s[-1]) if len(self.time_s) else math.nan
+        row = self.row_at(time)
+        empty = (math.nan, math.nan, 1)
+        mass, std, status = empty if row is None else (self.mass[row], self.std[row], self.status[row])
+        return Headline(
+            time,
+            float(mass if self.headline_mass is None else self.headline_mass),
+            # a mass from elsewhere does not have the estimate's uncertainty
+            float((std if self.headline_mass is None else math.nan) if self.headline_std is None else self.headline_std),
+            int(status if self.headline_status is None else self.headline_status),
+            float(self.truth_at(time)) if math.isfinite(time) else math.nan,
+        )
 
     @property
     def settled(self) -> tuple[float, float]:
         """Begin and end of the time the close-up shows [s]: up to the headline, after the last change before it."""
-        time = np.asarray(self.time_s)
-        end = float(self.headline_time_s)  # type: ignore[arg-type]
-        if not len(time):
+        if not len(self.time_s):
             return math.nan, math.nan
-        start = float(time.min())
-        events = np.concatenate((np.asarray(self.changes), np.asarray(self.truth_time_s)[1:], [start]))
+        end = self.headline.time_s
+        start = float(self.time_s.min())
+        events = np.concatenate((self.changes, self.truth[0], [start]))
         # a change at the very end, such as putting the object down, is not what the estimate settles from
         before = events[(events < end - 0.02 * (end - start)) & (events >= start)]
         last = float(before.max()) if before.size else start
-        return max(end - 0.3 * (float(time.max()) - start), last + 0.4 * (end - last)), end
+        return max(end - 0.3 * float(np.ptp(self.time_s)), last + 0.4 * (end - last)), end
