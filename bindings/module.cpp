@@ -3,6 +3,8 @@
 
 NB_MODULE(_core, m) {
   m.doc() = "palpate's C++ core. Use the palpate package; this module is its inside.";
+  // Reference arms are cached for the life of the interpreter and hold core objects when it ends: no leak.
+  nb::set_leak_warnings(false);
   m.attr("__version__") = PALPATE_VERSION;
   palpate_py::bind_arm(m);
   palpate_py::bind_pipeline(m);

@@ -21,13 +21,14 @@ body{{margin:0 auto;max-width:1140px;padding:28px 24px 48px;background:var(--pap
 font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",Arial,sans-serif;overflow-wrap:anywhere}}
 h1{{font-size:1.65rem;line-height:1.2;margin:0;font-weight:650}}
 h2{{font-size:1.15rem;margin:2.2rem 0 .4rem;font-weight:650;break-after:avoid}}
-p{{margin:.3rem 0 .6rem;max-width:78ch}}
+p{{margin:.3rem 0 .6rem;max-width:100ch}}
 .sub{{color:var(--muted);margin:.2rem 0 1.2rem}}
 .read{{color:var(--muted);font-size:.92rem}}
 .card{{display:flex;gap:24px;background:var(--card);border:1px solid var(--grid);border-radius:14px;
 padding:22px 26px;break-inside:avoid}}
 .card .words{{flex:1 1 0;min-width:0}}
-.card img{{width:34%;max-width:360px;object-fit:cover;border-radius:10px;align-self:stretch;min-height:0}}
+.card img{{width:32%;max-width:340px;height:auto;aspect-ratio:4/3;object-fit:cover;border-radius:10px;
+align-self:center}}
 .number{{font-size:3.3rem;line-height:1.1;font-weight:700;color:var(--blue);font-variant-numeric:tabular-nums}}
 .number small{{font-size:.5em;font-weight:600;white-space:nowrap}}
 .nowrap{{white-space:nowrap}}
@@ -41,25 +42,25 @@ figure{{margin:.6rem 0 0;break-inside:avoid}}
 .panels{{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(300px,100%),1fr));gap:8px 14px}}
 .panels figure{{margin:0}}
 svg.fig{{display:block;width:100%;height:auto;fill:var(--ink);stroke-linejoin:round;stroke-linecap:butt}}
-.narrow{{display:none}}
 .key{{display:flex;flex-wrap:wrap;gap:2px 20px;font-size:.9rem;margin:.4rem 0 .5rem;padding:0;list-style:none}}
 .key i{{display:inline-block;width:26px;height:0;vertical-align:middle;margin-right:7px;
 border-top:2.5px solid var(--tone)}}
 .key i.dash{{border-top-style:dashed;border-top-width:1.5px}}
 .key i.dots{{border-top-style:dotted;border-top-width:2px}}
 .key i.area{{border:0;height:11px;background:var(--tone);opacity:.3}}
+.narrow,.key.narrow{{display:none}}
 .scroll{{overflow-x:auto}}
 table{{border-collapse:collapse;font-size:.93rem;font-variant-numeric:tabular-nums;margin:.4rem 0}}
 th,td{{text-align:left;padding:.32em 1.4em .32em 0;border-bottom:1px solid var(--grid);vertical-align:top}}
 th{{font-weight:600}}thead th{{color:var(--muted);font-weight:500;font-size:.85rem}}
-td.n,th.n{{text-align:right}}
+tbody th{{min-width:9em}}td.n,th.n{{text-align:right}}td.n{{white-space:nowrap}}
 .yes,.no{{font-weight:650;white-space:nowrap}}.yes{{color:var(--green)}}.no{{color:var(--red)}}
 ul.plain{{margin:.3rem 0;padding-left:1.2em;font-size:.93rem}}
 footer{{margin-top:2.4rem;color:var(--muted);font-size:.85rem;border-top:1px solid var(--grid);padding-top:.7rem}}
 @media screen and (max-width:680px){{
 body{{padding:18px 14px 36px}}
 .card{{flex-direction:column;padding:16px 16px 18px;gap:14px}}
-.card img{{width:100%;max-width:none;max-height:240px}}
+.card img{{width:100%;max-width:none}}
 .number{{font-size:2.5rem}}
 .wide{{display:none}}.narrow{{display:block}}.key.narrow{{display:flex}}
 }}
@@ -67,6 +68,7 @@ body{{padding:18px 14px 36px}}
 @page{{size:A4;margin:13mm}}
 body{{padding:0;max-width:none;font-size:10.5pt}}
 .panels{{grid-template-columns:repeat(3,1fr);gap:2px 8px}}
+svg.fig{{min-width:0!important}}
 .card,.pill{{print-color-adjust:exact;-webkit-print-color-adjust:exact}}
 }}
 """
@@ -119,7 +121,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric: frozenset
 
     top = "".join(cell("th", i, escape(h)) for i, h in enumerate(head))
     body = "".join(
-        "<tr>" + "".join(cell("th" if i == 0 else "td", i, c) for i, c in enumerate(row)) + "</tr>" for row in rows
+        "<tr>" + "".join(cell("th" if i == 0 else "td", i, c) for i, c in enumerate(row)) + "</tr>"
+        for row in rows
     )
     return (
         '<div class="scroll"><table>'

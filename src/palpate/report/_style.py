@@ -115,13 +115,14 @@ def drawing() -> Iterator[None]:
         yield
 
 
-def svg(figure: Figure, label: str, prefix: str) -> str:
+def svg(figure: Figure, label: str, prefix: str, *, fixed: bool = False) -> str:
     """The figure as an ``<svg>`` element for a page whose CSS names the colours of the palette.
 
     Args:
         figure: what to draw; its colours out of the palette follow the page, others stay.
         label: what a screen reader says.
         prefix: letters and digits, different for every figure of a page, so that their ids differ.
+        fixed: keep near the figure's own size; else it becomes as wide as there is room.
     """
     out = io.BytesIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
@@ -137,15 +138,18 @@ def svg(figure: Figure, label: str, prefix: str) -> str:
     body = body.replace("xlink:href=", "href=")
     used = dict.fromkeys(re.findall(r'(?:url\(|href=")#([^)"]+)', body))
     names = {old: f"{prefix}-{i}" for i, old in enumerate(used)}
-    body = re.sub(
-        r' id="([^"]*)"', lambda m: f' id="{names[m[1]]}"' if m[1] in names else "", body
-    )
+    body = re.sub(r' id="([^"]*)"', lambda m: f' id="{names[m[1]]}"' if m[1] in names else "", body)
     body = re.sub(r'(url\(|href=")#([^)"]+)', lambda m: f"{m[1]}#{names[m[2]]}", body)
     body = re.sub(r' d="([^"]*)"', _shorter_path, body)
     body = re.sub(r'style="([^"]*)"', _page_style, body)
     body = re.sub(r"\s*\n\s*", "\n", body)
-    # the page's outer height follows its width
-    return f'<svg class="fig" role="img" aria-label="{escape(label)}" viewBox="{view[1]}">{body}'.strip()
+    width = (
+        108.0 * figure.get_size_inches()[0]
+    )  # the letters of 8 points get the size of the page's small print
+    size = f' style="max-width:{width:.0f}px;min-width:{0.7 * width:.0f}px"' if fixed else ""
+    return (
+        f'<svg class="fig" role="img" aria-label="{escape(label)}" viewBox="{view[1]}"{size}>{body}'.strip()
+    )
 
 
 def _shorter_path(match: re.Match[str]) -> str:

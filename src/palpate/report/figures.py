@@ -61,7 +61,8 @@ def _axes(figure: Figure, left: float, bottom: float, width: float, height: floa
 
 def _line(ax: Axes, x: Array, y: Array, points: int, **style: Any) -> None:
     """A curve in few points, broken where time or values are missing; a lone value is a dot."""
-    x, y = _series.envelope(*_series.break_at_gaps(x, y), points)
+    x, y = _series.break_at_gaps(x, y)
+    x, y = _series.envelope(x, y, points)
     if style.pop("steps", False):
         style["drawstyle"] = "steps-post"
     ax.plot(x, y, **style)
@@ -98,11 +99,15 @@ def _off_scale(ax: Axes, curves: Sequence[tuple[Array, Array, str]], unit: str) 
     low, high = ax.get_ylim()
     left, right = ax.get_xlim()
     above = below = 0
+    size = float(ax.yaxis.label.get_fontsize())
     for x, y, colour in curves:
         inside = np.isfinite(y) & (x >= left) & (x <= right)
         if not inside.any():
             continue
-        for index, arrow in ((np.where(inside, y, -np.inf).argmax(), "↑"), (np.where(inside, y, np.inf).argmin(), "↓")):
+        for index, arrow in (
+            (np.where(inside, y, -np.inf).argmax(), "↑"),
+            (np.where(inside, y, np.inf).argmin(), "↓"),
+        ):
             up = arrow == "↑"
             if (y[index] <= high) if up else (y[index] >= low):
                 continue
@@ -113,12 +118,12 @@ def _off_scale(ax: Axes, curves: Sequence[tuple[Array, Array, str]], unit: str) 
                 f"{arrow} {number(float(y[index]), 3)} {unit}",
                 (float(x[index]), 1.0 if up else 0.0),
                 xycoords=ax.get_xaxis_transform(),
-                xytext=(-3 if late else 3, -2 - 9 * row if up else 2 + 9 * row),
+                xytext=(-3 if late else 3, -2 - 1.2 * size * row if up else 2 + 1.2 * size * row),
                 textcoords="offset points",
                 ha="right" if late else "left",
                 va="top" if up else "bottom",
-                fontsize="small",
                 color=colour,
+                fontsize=0.85 * size,
                 parse_math=False,
             )
 
@@ -143,22 +148,23 @@ def _apart(centres: Sequence[float], heights: Sequence[float]) -> list[float]:
     return placed
 
 
-def _label_ends(ax: Axes, labels: Sequence[tuple[float, str, str]], wrap: int) -> None:
-    """Name curves beside their right ends: (value, name, colour) each."""
+def _label_ends(ax: Axes, labels: Sequence[tuple[float, str, str]], wrap: int, size: float = 8.0) -> None:
+    """Name curves beside their right ends: (value, name, colour) each; wrapped to `wrap` letters of `size` points."""
     low, high = ax.get_ylim()
     texts = [textwrap.wrap(clean(name), wrap, max_lines=3, placeholder="…") or [""] for _, name, _ in labels]
-    size = ax.figure.get_size_inches()[1] * ax.get_position().height * 72.0
-    heights = [(9.5 * len(t) + 3.0) / size for t in texts]
+    height = 72.0 * ax.get_window_extent().height / ax.figure.dpi
+    heights = [(1.2 * size * len(t) + 0.4 * size) / height for t in texts]
     values = [min(max((v - low) / (high - low), 0.0), 1.0) for v, _, _ in labels]
     for y, text, (_, _, colour) in zip(_apart(values, heights), texts, labels, strict=True):
         ax.annotate(
             "\n".join(text),
             (1.0, y),
             xycoords="axes fraction",
-            xytext=(5, 0),
+            xytext=(0.6 * size, 0),
             textcoords="offset points",
             va="center",
             color=colour,
+            fontsize=size,
             parse_math=False,
         )
 
@@ -166,7 +172,9 @@ def _label_ends(ax: Axes, labels: Sequence[tuple[float, str, str]], wrap: int) -
 def _shade(ax: Axes, spans: Sequence[tuple[float, float, int]]) -> None:
     for begin, end, status in spans:
         if status:
-            ax.axvspan(begin, end, color=LIGHT[status_text(status).colour], alpha=0.13, linewidth=0.0, zorder=0.5)
+            ax.axvspan(
+                begin, end, color=LIGHT[status_text(status).colour], alpha=0.13, linewidth=0.0, zorder=0.5
+            )
 
 
 def _ribbon(ax: Axes, spans: Sequence[tuple[float, float, int]], width: float) -> None:
@@ -179,7 +187,13 @@ def _ribbon(ax: Axes, spans: Sequence[tuple[float, float, int]], width: float) -
         begin, length = max(mine, key=lambda m: m[1])
         if length / (right - left) * width > 0.068 * len(text.name) + 0.06:
             ax.text(
-                begin + 0.5 * length, 0.46, text.name, ha="center", va="center", fontsize="small", clip_on=True
+                begin + 0.5 * length,
+                0.46,
+                text.name,
+                ha="center",
+                va="center",
+                fontsize="small",
+                clip_on=True,
             )
     ax.set_ylim(0.0, 1.0)
     ax.set_yticks([])
@@ -246,8 +260,13 @@ def mass_figure(report: WeighReport, *, narrow: bool = False) -> Figure:
         return figure
 
 
-def _draw_mass(ax: Axes, report: WeighReport, points: int, *, labels: bool) -> tuple[float, str]:
-    """Everything of the mass over the whole time; returns the unit's factor and name."""
+def _draw_mass(
+    ax: Axes, report: WeighReport, points: int, *, labels: bool, size: float = 8.0, thick: float = 1.0
+) -> tuple[float, str]:
+    """Everything of the mass over the whole time; returns the unit's factor and name.
+
+    `size` of the names at the curves in points; `thick` multiplies the widths of the lines.
+    """
     time, mass, std = report.time_s, report.mass, report.std
     factor, unit = mass_unit([report.headline.mass, *report.truth[1].tolist()])
     ax.set_ylim(*_mass_range(report, factor))
@@ -277,30 +296,29 @@ def _draw_mass(ax: Axes, report: WeighReport, points: int, *, labels: bool) -> t
             ends.append((float(y[finite[-1]]) * factor, name, style["color"]))
 
     for index, (name, other) in enumerate(report.others.items()):
-        curve(other, name, **line_style("", index))
-    curve(mass, "palpate ± 95 %" if np.isfinite(std).any() else "palpate", color=LIGHT["blue"], linewidth=1.5)
+        curve(other, name, **{**line_style("", index), "linewidth": 1.1 * thick})
+    ours = "palpate ± 95 %" if np.isfinite(std).any() else "palpate"
+    curve(mass, ours, color=LIGHT["blue"], linewidth=1.5 * thick)
     if report.truth_known:
         corners, values = _truth_steps(report)
         ax.plot(
             corners,
             values * factor,
             color=LIGHT["ink"],
-            linewidth=0.9,
+            linewidth=0.9 * thick,
             linestyle=(0, (5, 3)),
             drawstyle="steps-post",
         )
         ends.append((float(values[np.isfinite(values)][-1]) * factor, "truth", LIGHT["ink"]))
     for moment in np.asarray(report.changes)[:50]:
-        ax.axvline(moment, color=LIGHT["muted"], linewidth=0.7, linestyle=(0, (1, 2)))
+        ax.axvline(moment, color=LIGHT["muted"], linewidth=0.7 * thick, linestyle=(0, (1, 2)))
     _off_scale(ax, curves, unit)
     if labels:
-        _label_ends(ax, ends, 15)
+        _label_ends(ax, ends, 15, size)
     return factor, unit
 
 
-def _draw_close_up(
-    ax: Axes, main: Axes, report: WeighReport, factor: float, unit: str, points: int
-) -> None:
+def _draw_close_up(ax: Axes, main: Axes, report: WeighReport, factor: float, unit: str, points: int) -> None:
     """The settled part, so near that the band has a width."""
     begin, end = report.settled
     time, mass, std = report.time_s, report.mass, report.std
@@ -323,8 +341,6 @@ def _draw_close_up(
         points // 2,
         color=LIGHT["blue"],
     )
-    for index, other in enumerate(report.others.values()):
-        _line(ax, time[shown], other[shown] * factor, points // 2, **line_style("", index))
     _line(ax, time[shown], mass[shown] * factor, points // 2, color=LIGHT["blue"], linewidth=1.5)
     truth = report.truth_at(time[shown]) * factor
     if np.isfinite(truth).any():
@@ -343,12 +359,12 @@ def _draw_close_up(
     ax.set_xlabel("time [s]")
     ax.set_ylabel(f"mass [{unit}]")
     # where in the large picture this is
-    low, high = main.get_ylim()
-    main.plot([begin, end], [low + 0.012 * (high - low)] * 2, color=LIGHT["muted"], linewidth=2.5, alpha=0.6)
+    across = main.get_xaxis_transform()
+    main.plot([begin, end], [1.02, 1.02], transform=across, clip_on=False, color=LIGHT["grey"], linewidth=2.0)
     main.annotate(
         "close-up",
-        (0.5 * (begin + end), 0.012),
-        xycoords=main.get_xaxis_transform(),
+        (0.5 * (begin + end), 1.02),
+        xycoords=across,
         xytext=(0, 3),
         textcoords="offset points",
         ha="center",
@@ -370,6 +386,7 @@ def joints_figure(
     curves: Mapping[str, npt.ArrayLike],
     joint_names: Sequence[str],
     *,
+    quantity: str = "position",
     unit: str | Sequence[str] = "rad",
     std: npt.ArrayLike | None = None,
     notes: Sequence[str] | None = None,
@@ -383,7 +400,8 @@ def joints_figure(
         time_s: (N,) [s].
         curves: by name, (N, n) each; "measured", "estimated" and "desired" look the same in every figure.
         joint_names: n names.
-        unit: of the vertical axes, one for all or one per joint.
+        quantity: what the vertical axes show.
+        unit: of it, one for all or one per joint.
         std: (N, n) standard deviation of the last curve, drawn as a band of ± 2 of them.
         notes: n remarks, right above each panel.
         columns: panels beside each other.
@@ -435,16 +453,22 @@ def joints_figure(
             drawn = []
             for index, (label, values) in enumerate(lines.items()):
                 style = line_style(label, index)
+                if deviation is not None:  # noise as wide as its band must leave the band to be seen
+                    style["linewidth"] = 0.6
                 _line(ax, time, values[:, joint], points, **style)
                 drawn.append((time, values[:, joint], style["color"]))
-            _off_scale(ax, drawn[-1:], units[joint])
+            _off_scale(ax, drawn, clean(units[joint], 12))
             _ticks(ax, 6, 4)
             ax.set_title(clean(name, 34), loc="left", parse_math=False)
             if notes is not None:
                 ax.set_title(
-                    clean(notes[joint], 60), loc="right", fontsize="small", color=LIGHT["muted"], parse_math=False
+                    clean(notes[joint], 60),
+                    loc="right",
+                    fontsize="small",
+                    color=LIGHT["muted"],
+                    parse_math=False,
                 )
-            ax.set_ylabel(clean(units[joint], 20), parse_math=False)
+            ax.set_ylabel(f"{clean(quantity, 20)} [{clean(units[joint], 12)}]", parse_math=False)
             ax.set_xlabel("time [s]", labelpad=1.0)
         if key:
             _key(figure, list(lines), deviation is not None)
@@ -527,6 +551,7 @@ def torque_figure(
         time_s,
         {"estimated": values},
         joint_names,
+        quantity="torque",
         unit=units,
         std=std,
         notes=notes,
@@ -595,7 +620,9 @@ def coverage_figure(error: npt.ArrayLike, std: npt.ArrayLike) -> Figure:
     errors = np.asarray(error, dtype=np.float64)
     spread = np.asarray(std, dtype=np.float64)
     if errors.ndim != 1 or errors.shape != spread.shape:
-        raise InputError(f"error and std must have the same shape (M,), got {errors.shape} and {spread.shape}")
+        raise InputError(
+            f"error and std must have the same shape (M,), got {errors.shape} and {spread.shape}"
+        )
     if np.any(spread <= 0.0):
         raise InputError("std must be > 0")
     finite = np.isfinite(errors) & np.isfinite(spread)
@@ -634,9 +661,18 @@ def coverage_figure(error: npt.ArrayLike, std: npt.ArrayLike) -> Figure:
                 ha="right",
                 color=LIGHT["blue"],
             )
-            left.text(0.04, 0.95, "grey: chance", transform=left.transAxes, color=LIGHT["muted"], fontsize="small")
+            left.text(
+                0.04, 0.95, "grey: chance", transform=left.transAxes, color=LIGHT["muted"], fontsize="small"
+            )
             bins = int(min(max(round(2.0 * math.sqrt(z.size)), 8), 40))
-            right.hist(np.clip(z, -4.0, 4.0), bins=bins, range=(-4.0, 4.0), density=True, color=LIGHT["blue"], alpha=0.45)
+            right.hist(
+                np.clip(z, -4.0, 4.0),
+                bins=bins,
+                range=(-4.0, 4.0),
+                density=True,
+                color=LIGHT["blue"],
+                alpha=0.45,
+            )
         left.set_title("calibration", loc="left")
         right.set_title("errors in units of σ", loc="left")
         return figure
@@ -666,14 +702,29 @@ def table_figure(rows: Sequence[StudyRow], *, title: str = "") -> Figure:
         if title:
             ax.text(0.0, y, clean(title, 110), fontsize=11, fontweight="bold", va="center", parse_math=False)
             y += 0.38
-        places = ((0.0, "left", 52), (5.0, "right", 22), (6.4, "right", 22), (7.7, "right", 18), (8.5, "right", 8))
+        places = (
+            (0.0, "left", 52),
+            (5.0, "right", 22),
+            (6.4, "right", 22),
+            (7.7, "right", 18),
+            (8.5, "right", 8),
+        )
         head = ("quantity", "published or required", "palpate", "tolerance", "")
         for line, cells in enumerate((head, *(row.cells() for row in rows))):
             for column, ((x, align, limit), text) in enumerate(zip(places, cells, strict=True)):
                 colour = LIGHT["muted"] if line == 0 else LIGHT["ink"]
                 if line and column == 4:
-                    colour = {True: LIGHT["green"], False: LIGHT["red"]}.get(rows[line - 1].ok, LIGHT["muted"])
-                ax.text(x, y, clean(text, limit), ha=align, va="center", color=colour, fontsize=8.5, parse_math=False)
+                    colour = LIGHT["green" if rows[line - 1].ok else "red"]
+                ax.text(
+                    x,
+                    y,
+                    clean(text, limit),
+                    ha=align,
+                    va="center",
+                    color=colour,
+                    fontsize=8.5,
+                    parse_math=False,
+                )
             y += 0.16
             ax.plot([0.0, 8.6], [y, y], color=LIGHT["grid"], linewidth=0.7)
             y += 0.16
@@ -722,30 +773,26 @@ def _cover(ax: Axes, pixels: npt.NDArray[np.uint8], aspect: float) -> None:
 
 
 def _draw_hero(figure: Figure, report: WeighReport) -> None:
-    import matplotlib
-
-    ink, muted = LIGHT["ink"], LIGHT["muted"]
-    large = {"font.size": 16.0, "xtick.labelsize": 15.0, "ytick.labelsize": 15.0, "axes.labelsize": 16.0}
-    with matplotlib.rc_context(large):
-        mass, std = report.headline.mass, report.headline.std
-        truth = report.headline.truth
-        factor, unit = mass_unit([mass, *report.truth[1].tolist()])
-        value, half = rounded(mass * factor, TWO_SIDED_95 * std * factor)
-        figure.text(7.0 / 16, 6.1 / 7, f"{value} {unit}", fontsize=44, fontweight="bold", color=LIGHT["blue"])
-        words = [f"± {half} {unit} (95 %)"] if half != "?" else []
-        if math.isfinite(truth):
-            words.append(f"truth {number(truth * factor)} {unit}")
-        if report.time_to_2_percent_s is not None and math.isfinite(report.time_to_2_percent_s):
-            words.append(f"within 2 % after {report.time_to_2_percent_s:.1f} s")
-        figure.text(7.03 / 16, 5.62 / 7, "   ·   ".join(words), fontsize=17, color=muted)
-        figure.text(15.7 / 16, 6.62 / 7, clean(report.title, 60), fontsize=15, color=muted, ha="right", parse_math=False)
-        ax = _axes(figure, 7.3, 0.85, 8.3, 4.35)
-        _draw_mass(ax, report, MASS_POINTS, labels=False)
-        for line in ax.lines:
-            line.set_linewidth(2.4 * line.get_linewidth())
-        for spine in ax.spines.values():
-            spine.set_linewidth(1.2)
-        _ticks(ax, 8, 6)
-        ax.set_xlabel("time [s]")
-        ax.spines["left"].set_color(ink)
-        ax.spines["bottom"].set_color(ink)
+    _, mass, std, _, truth = report.headline
+    factor, unit = mass_unit([mass, *report.truth[1].tolist()])
+    value, half = rounded(mass * factor, TWO_SIDED_95 * std * factor)
+    words = [f"± {half} {unit} (95 %)"] if half != "?" else []
+    if math.isfinite(truth):
+        words.append(f"truth {number(truth * factor)} {unit}")
+    if report.time_to_2_percent_s is not None and math.isfinite(report.time_to_2_percent_s):
+        words.append(f"within 2 % after {report.time_to_2_percent_s:.1f} s")
+    for x, y, text, size, colour, options in (
+        (6.7, 6.5, clean(report.title, 80), 15.0, "muted", {}),
+        (6.68, 5.75, f"{value} {unit}", 44.0, "blue", {"fontweight": "bold"}),
+        (6.7, 5.3, "   ·   ".join(words), 17.0, "muted", {}),
+    ):
+        figure.text(x / 16, y / 7, text, fontsize=size, color=LIGHT[colour], parse_math=False, **options)
+    ax = _axes(figure, 7.3, 0.85, 6.65, 4.0)
+    for label in (ax.xaxis.label, ax.yaxis.label):
+        label.set_fontsize(16.0)
+    ax.tick_params(labelsize=15.0)
+    _draw_mass(ax, report, MASS_POINTS, labels=True, size=15.0, thick=1.8)
+    for name in ("left", "bottom"):
+        ax.spines[name].set(linewidth=1.2, color=LIGHT["ink"])
+    _ticks(ax, 7, 6)
+    ax.set_xlabel("time [s]")

@@ -100,7 +100,9 @@ def update_markdown(path: str | PathLike[str], name: str, text: str, *, title: s
             read or written.
     """
     if not re.fullmatch(r"[A-Za-z0-9._-]+", name):
-        raise InputError(f"name of a section must be letters, digits, dots, dashes, underscores; got {name!r:.80}")
+        raise InputError(
+            f"name of a section must be letters, digits, dots, dashes, underscores; got {name!r:.80}"
+        )
     if re.search(r"<!--\s*(begin|end) [A-Za-z0-9._-]+\s*-->", text):
         raise InputError(f"text of section {name!r} holds a section marker itself")
     target = Path(path)
@@ -164,8 +166,9 @@ def write_study(
     if rows:
         sections.append(_study_table(rows))
     for index, (caption, figure) in enumerate(figures.items()):
-        drawn = svg(figure, clean(caption), f"f{index}")
-        sections.append(f"<figure>{drawn}<figcaption class=\"read\">{escape(caption, 1000)}</figcaption></figure>")
+        drawn = svg(figure, clean(caption), f"f{index}", fixed=True)
+        caption_html = f'<figcaption class="read">{escape(caption, 1000)}</figcaption>'
+        sections.append(f'<figure><div class="scroll">{drawn}</div>{caption_html}</figure>')
     if options:
         sections.append(_page.section("Settings", _page.mapping_table(options)))
     if provenance:

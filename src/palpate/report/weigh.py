@@ -80,11 +80,7 @@ def _card(report: WeighReport) -> str:
         f'<div class="number">{value} <small>{unit}</small>{spread}</div>',
         '<p class="read">'
         + ("no standard deviation was given" if half == "?" else "± is half of the 95 % interval (1.96 σ)")
-        + (
-            ""
-            if _at_end(report)
-            else f", known at {number(report.headline.time_s, 4)} s"
-        )
+        + ("" if _at_end(report) else f", known at {number(report.headline.time_s, 4)} s")
         + "</p>",
         f'<p><span class="pill" style="--tone:var(--{status.colour})">{escape(status.name)}</span>'
         f"{escape(status.meaning)}</p>",
@@ -152,7 +148,7 @@ def _mass(report: WeighReport) -> str:
     key += [(name, OTHERS[i % len(OTHERS)], "line") for i, name in enumerate(report.others)]
     text = (
         "The line is the estimated mass, the shade around it holds the truth in 95 of 100 cases if the model is right; "
-        "the close-up shows the settled part at a scale at which that shade has a width. "
+        "the close-up shows our estimate once settled, at a scale at which that shade has a width. "
         "The strip below the time axis is the status of every moment, and where it is not ok the picture is tinted: "
         "do not use the number there."
     )
@@ -187,10 +183,9 @@ def _comparison(report: WeighReport) -> str:
     known = bool(np.isfinite(truth[shown]).any())
     factor, unit = mass_unit([report.headline.mass, *report.truth[1].tolist()])
     rows = []
-    for name, values in (("palpate", report.mass), *report.others.items()):
-        series = np.asarray(values)
+    for name, series in (("palpate", report.mass), *report.others.items()):
         mass = float(series[row]) if row is not None else math.nan
-        cells = [escape(name), f"{number(mass * factor)} {unit}"]
+        cells = [escape(name), f"{number(mass * factor, 5)} {unit}"]
         if known:
             error = mass - report.headline.truth
             settled = (series - truth)[shown]
@@ -210,9 +205,7 @@ def _unit(report: WeighReport, joint: int, revolute: str, prismatic: str) -> str
     return prismatic if report.joint_kinds and report.joint_kinds[joint] == "prismatic" else revolute
 
 
-def _panels(
-    report: WeighReport, build: Callable[[int], Figure], what: str, prefix: str
-) -> str:
+def _panels(report: WeighReport, build: Callable[[int], Figure], what: str, prefix: str) -> str:
     """One small figure per joint, so that the page can put as many beside each other as fit."""
     parts = [
         f"<figure>{svg(build(j), f'{what} of joint {clean(name, 60)}', f'{prefix}{j}')}</figure>"
@@ -263,12 +256,14 @@ def _joints(report: WeighReport) -> list[str]:
             j: int,
             curves: dict[str, Array] = curves,
             units: tuple[str, str] = units,
+            quantity: str = heading.lower().removesuffix("s"),
             notes: list[str] | None = notes,
         ) -> Figure:
             return joints_figure(
                 report.time_s,
                 {name: v[:, j : j + 1] for name, v in curves.items()},
                 [report.joint_names[j]],
+                quantity=quantity,
                 unit=_unit(report, j, *units),
                 notes=None if notes is None else [notes[j]],
                 columns=1,
@@ -334,6 +329,7 @@ def _efforts(report: WeighReport, effort: Array, points: int) -> str:
             report.time_s,
             {"measured": effort[:, j : j + 1]},
             [report.joint_names[j]],
+            quantity="effort",
             unit=report.effort_unit,
             columns=1,
             key=False,
@@ -364,5 +360,7 @@ def _error(report: WeighReport) -> str:
         "Neighbouring samples share their error, so one run strays for a while or not at all; "
         "what lies beyond ± 6 is drawn at the edge."
     )
-    figures = _both(lambda narrow: error_figure(report, narrow=narrow), "error in standard deviations", "error")
+    figures = _both(
+        lambda narrow: error_figure(report, narrow=narrow), "error in standard deviations", "error"
+    )
     return _page.section("Is the stated uncertainty true?", figures, _page.read(text))

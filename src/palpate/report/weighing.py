@@ -228,6 +228,11 @@ class WeighReport:
         index = np.searchsorted(times, np.asarray(time_s, dtype=np.float64), side="right")
         return np.concatenate(([np.nan], masses))[index]
 
+    @property
+    def truth_known(self) -> bool:
+        """True if the true mass is known at some sample."""
+        return bool(np.isfinite(self.truth_at(self.time_s)).any())
+
     def row_at(self, time_s: float) -> int | None:
         """Index of the last sample at or before a time, of the first if there is none; None without samples."""
         if not len(self.time_s):
@@ -248,7 +253,11 @@ class WeighReport:
             time,
             float(mass if self.headline_mass is None else self.headline_mass),
             # a mass from elsewhere does not have the estimate's uncertainty
-            float((std if self.headline_mass is None else math.nan) if self.headline_std is None else self.headline_std),
+            float(
+                (std if self.headline_mass is None else math.nan)
+                if self.headline_std is None
+                else self.headline_std
+            ),
             int(status if self.headline_status is None else self.headline_status),
             float(self.truth_at(time)) if math.isfinite(time) else math.nan,
         )
