@@ -41,8 +41,10 @@ class Pipeline {
     JointSample s = conditioner_.step(raw);
     const double gain = conditioner_.velocity_noise_gain();
     for (int j = 0; j < arm_->n(); ++j) {
-      const double measured = arm_->joint(j).velocity_std;
-      s.dq_std[detail::at(j)] = s.velocity_measured ? (std::isfinite(measured) ? measured : 0.0) : gain * std::sqrt(arm_->position_variance(j));
+      // A driver's velocity of undeclared quality is taken for what it mostly is: a difference of the same positions.
+      const double declared = arm_->joint(j).velocity_std;
+      const bool use = s.velocity_measured && std::isfinite(declared);
+      s.dq_std[detail::at(j)] = use ? declared : gain * std::sqrt(arm_->position_variance(j));
     }
     Touch touch;
     touch.time_ns = s.time_ns;

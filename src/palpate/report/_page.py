@@ -62,6 +62,7 @@ body{{padding:18px 14px 36px}}
 .card{{flex-direction:column;padding:16px 16px 18px;gap:14px}}
 .card img{{width:100%;max-width:none}}
 .number{{font-size:2.5rem}}
+table{{font-size:.84rem}}th,td{{padding-right:.7em}}tbody th{{min-width:7em}}
 .wide{{display:none}}.narrow{{display:block}}.key.narrow{{display:flex}}
 }}
 @media print{{

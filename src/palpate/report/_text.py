@@ -60,7 +60,8 @@ def rounded(value: float, spread: float) -> tuple[str, str]:
     exponent = math.floor(math.log10(spread))
     digits = 1 if spread / 10.0**exponent < 2.95 else 0
     decimals = min(max(digits - exponent, 0), 9)
-    return f"{value:.{decimals}f}".replace("-", "−"), f"{spread:.{decimals}f}"
+    # adding 0.0 turns a rounded -0.0 into 0.0
+    return f"{round(value, decimals) + 0.0:.{decimals}f}".replace("-", "−"), f"{spread:.{decimals}f}"
 
 
 class StatusText(NamedTuple):

@@ -129,7 +129,7 @@ def _off_scale(ax: Axes, curves: Sequence[tuple[Array, Array, str]], unit: str) 
 
 
 def _apart(centres: Sequence[float], heights: Sequence[float]) -> list[float]:
-    """Centres of labels moved as little as possible (least squares) so that they do not overlap."""
+    """Centres of labels in 0..1, moved as little as possible (least squares) so that they do not overlap."""
     order = sorted(range(len(centres)), key=lambda i: centres[i])
     offset, groups = 0.0, []
     offsets = []
@@ -143,8 +143,10 @@ def _apart(centres: Sequence[float], heights: Sequence[float]) -> list[float]:
             groups[-2:] = [[(a * n + b * m) / (n + m), n + m]]
     base = [value for value, count in groups for _ in range(int(count))]
     placed = [0.0] * len(order)
+    lowest = 0.5 * heights[order[0]] if order else 0.0
+    highest = max(1.0 - offset - 0.5 * heights[order[-1]], lowest) if order else 0.0
     for i, shift, at in zip(order, offsets, base, strict=True):
-        placed[i] = shift + at
+        placed[i] = shift + min(max(at, lowest), highest)
     return placed
 
 
@@ -453,6 +455,8 @@ def joints_figure(
             drawn = []
             for index, (label, values) in enumerate(lines.items()):
                 style = line_style(label, index)
+                if len(lines) == 1:
+                    style["linewidth"] = 1.1
                 if deviation is not None:  # noise as wide as its band must leave the band to be seen
                     style["linewidth"] = 0.6
                 _line(ax, time, values[:, joint], points, **style)
@@ -780,13 +784,15 @@ def _draw_hero(figure: Figure, report: WeighReport) -> None:
     if math.isfinite(truth):
         words.append(f"truth {number(truth * factor)} {unit}")
     if report.time_to_2_percent_s is not None and math.isfinite(report.time_to_2_percent_s):
-        words.append(f"within 2 % after {report.time_to_2_percent_s:.1f} s")
-    for x, y, text, size, colour, options in (
-        (6.7, 6.5, clean(report.title, 80), 15.0, "muted", {}),
-        (6.68, 5.75, f"{value} {unit}", 44.0, "blue", {"fontweight": "bold"}),
-        (6.7, 5.3, "   ·   ".join(words), 17.0, "muted", {}),
+        words.append(f"within 2 % after {number(report.time_to_2_percent_s, 3)} s")
+    for x, y, text, size, colour, weight in (
+        (6.7, 6.5, clean(report.title, 80), 15.0, "muted", "normal"),
+        (6.68, 5.75, f"{value} {unit}", 44.0, "blue", "bold"),
+        (6.7, 5.3, "   ·   ".join(words), 17.0, "muted", "normal"),
     ):
-        figure.text(x / 16, y / 7, text, fontsize=size, color=LIGHT[colour], parse_math=False, **options)
+        figure.text(
+            x / 16, y / 7, text, fontsize=size, color=LIGHT[colour], fontweight=weight, parse_math=False
+        )
     ax = _axes(figure, 7.3, 0.85, 6.65, 4.0)
     for label in (ax.xaxis.label, ax.yaxis.label):
         label.set_fontsize(16.0)

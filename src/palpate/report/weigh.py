@@ -115,11 +115,11 @@ def _facts(report: WeighReport, mass: float, std: float, factor: float, unit: st
             more = [f"{_signed(100.0 * error / truth, 2)} %"] if truth else []
             if std > 0.0:
                 more.append(f"{number(abs(error) / std, 2)} σ")
-            facts.append(_fact("error", f"{_signed(error * factor, 3)} {unit}", ", ".join(more)))
+            facts.append(_fact("error", f"{_signed(error * factor, 2)} {unit}", ", ".join(more)))
     settling = report.time_to_2_percent_s
     if settling is not None:
         never = not math.isfinite(settling)
-        facts.append(_fact("time to 2 %", "not reached" if never else f"{settling:.2f} s"))
+        facts.append(_fact("time to 2 %", "not reached" if never else f"{number(settling, 3)} s"))
     changes = len(np.asarray(report.changes))
     if changes:
         facts.append(_fact("changes of load found", str(changes)))
@@ -191,8 +191,8 @@ def _comparison(report: WeighReport) -> str:
             settled = (series - truth)[shown]
             settled = settled[np.isfinite(settled)]
             rms = math.sqrt(float(np.mean(np.square(settled)))) if settled.size else math.nan
-            cells.append(f"{_signed(error * factor, 3)} {unit}" if math.isfinite(error) else "–")
-            cells.append(f"{number(rms * factor, 3)} {unit}")
+            cells.append(f"{_signed(error * factor, 2)} {unit}" if math.isfinite(error) else "–")
+            cells.append(f"{number(rms * factor, 2)} {unit}")
         rows.append(cells)
     head = ["estimator", f"mass at {number(report.headline.time_s)} s"]
     if known:
