@@ -311,7 +311,7 @@ extern "C" void PALPATE_RIVAL(const palpate::ArmDescription* arm, Job job, conte
     case Job::momentum:
       enter(std::type_identity<Momentum<TermsByMatrices>>{}, "crba, computeCoriolisMatrix, computeGeneralizedGravity");
       enter(std::type_identity<Momentum<TermsByNewtonEuler>>{}, "rnea, computeCoriolisMatrix, computeGeneralizedGravity");
-      enter(std::type_identity<Momentum<TermsByOwnSweep>>{}, "own sweep on forwardKinematics");
+      enter(std::type_identity<Momentum<TermsByOwnSweep>>{}, "by hand: one sweep on forwardKinematics");
       break;
     case Job::sliding_mode: enter(std::type_identity<SlidingMode>{}, "crba, 4 nonLinearEffects, LLT", 1); break;
     case Job::sliding_mode_twice: enter(std::type_identity<SlidingMode>{}, "crba, 8 nonLinearEffects, LLT", 2); break;

@@ -8,6 +8,37 @@
 
 namespace palpate {
 
+namespace detail {
+
+/// Bodies on the last link for one unit of each load parameter: m at the grasp point, and m delta along the tip's axes.
+inline std::array<Inertia<double>, 4> load_basis(const Arm& arm) noexcept {
+  const Vec3<double> c = arm.p_last_grasp();
+  const Mat3<double> R = arm.R_last_tip();
+  return {about_origin(1.0, c, Sym3<double>{}), Inertia<double>{0.0, R.cx, parallel_axis(R.cx, c)},
+          Inertia<double>{0.0, R.cy, parallel_axis(R.cy, c)}, Inertia<double>{0.0, R.cz, parallel_axis(R.cz, c)}};
+}
+
+/// Forward, at rest or backward, per joint, with hysteresis: while it stays, so does the error of the friction model.
+class Regime {
+ public:
+  /// True if joint j has started, stopped or reversed.
+  bool changed(const Arm& arm, int j, double dq) noexcept {
+    const double v0 = arm.joint(j).friction.sign_velocity;
+    int& now = regime_[at(j)];
+    const double threshold = now == 0 ? 1.25 * v0 : 0.75 * v0;
+    const int next = dq > threshold ? 1 : dq < -threshold ? -1 : 0;
+    const bool changed = next != now;
+    now = next;
+    return changed;
+  }
+  bool at_rest(int j) const noexcept { return regime_[at(j)] == 0; }
+
+ private:
+  std::array<int, max_joints> regime_{};
+};
+
+}  // namespace detail
+
 struct JointFormulaConfig {
   int joint = -1;                 ///< counted from 0; -1: the one nearest to the tip that feels the load in this pose
   double lever = std::numeric_limits<double>::quiet_NaN();    ///< axis to load [m]; NaN: to the grasp point (the published l4 is 0.21)
@@ -99,7 +130,7 @@ struct RegressionConfig {
 /// correlation time. All errors of one kind at one joint are thus one unknown, not thousands. (MATH.md section 4.)
 class Regression {
  public:
-  explicit Regression(const Arm& arm, const RegressionConfig& config = {}) : arm_(&arm), config_(config), loads_(config.first_moment ? 4 : 1) {
+  explicit Regression(const Arm& arm, const RegressionConfig& config = {}) : arm_(&arm), config_(config), loads_(config.first_moment ? 4 : 1), unit_(detail::load_basis(arm)) {
     check::positive("RegressionConfig mass_prior_std [kg]", config.mass_prior_std);
     check::positive("RegressionConfig offset_prior_std [m]", config.offset_prior_std);
     check::not_negative("RegressionConfig lag [s]", config.lag);
@@ -108,11 +139,6 @@ class Regression {
     check::positive("RegressionConfig bias_time [s]", config.bias_time);
     check::positive("RegressionConfig ok_relative [1]", config.ok_relative);
     check::positive("RegressionConfig ok_absolute [kg]", config.ok_absolute);
-    const Vec3<double> c = arm.p_last_grasp();
-    const Mat3<double> R = arm.R_last_tip();
-    const std::array<Vec3<double>, 3> axes{R.cx, R.cy, R.cz};
-    unit_[0] = about_origin(1.0, c, Sym3<double>{});
-    for (std::size_t k = 0; k < 3; ++k) unit_[k + 1] = {0.0, axes[k], parallel_axis(axes[k], c)};
     for (int k = 0; k < loads_; ++k) {
       const double prior = k == 0 ? config.mass_prior_std : config.mass_prior_std * config.offset_prior_std;
       P(k, k) = prior * prior;
@@ -162,25 +188,17 @@ class Regression {
     }
   }
 
-  /// -1, 0, +1 with hysteresis: the state of motion whose friction error stays the same.
-  int regime(int j, double dq) const noexcept {
-    const double v0 = arm_->joint(j).friction.sign_velocity;
-    const double threshold = regime_[u(j)] == 0 ? 1.25 * v0 : 0.75 * v0;
-    return dq > threshold ? 1 : dq < -threshold ? -1 : 0;
-  }
-
   void predict(const JointSample& s, double dt) noexcept {
     const double phi = std::exp(-dt / config_.bias_time);
     const double smoothing = -std::expm1(-dt / 0.02);
     for (int j = 0; j < arm_->n(); ++j) {
       slow_dq_[u(j)] = started_ ? slow_dq_[u(j)] + smoothing * (s.dq[u(j)] - slow_dq_[u(j)]) : s.dq[u(j)];
       const JointDescription& d = arm_->joint(j);
-      const int now = regime(j, slow_dq_[u(j)]);
-      const double rest = d.friction.uncertainty(now == 0 ? 0.0 : 1e3 * d.friction.sign_velocity, config_.friction_fraction);
+      const bool changed = regime_.changed(*arm_, j, slow_dq_[u(j)]);
+      const double rest = d.friction.uncertainty(regime_.at_rest(j) ? 0.0 : 1e3 * d.friction.sign_velocity, config_.friction_fraction);
       const double gain = d.torque_gain_std * s.tau[u(j)];
       const double variance = rest * rest + gain * gain;
-      const double keep = !started_ || now != regime_[u(j)] ? 0.0 : phi;
-      regime_[u(j)] = now;
+      const double keep = !started_ || changed ? 0.0 : phi;
       const int row = loads_ + j;
       x_[u(row)] *= keep;
       for (int c = 0; c < dim(); ++c) P(row, c) *= keep;
@@ -226,10 +244,10 @@ class Regression {
   const Arm* arm_;
   RegressionConfig config_;
   int loads_;
-  std::array<Inertia<double>, 4> unit_{};
+  std::array<Inertia<double>, 4> unit_;
   std::array<JointVector, 4> H_{};  // d tau_ext / d theta
   JointVector dq_{}, ddq_{}, slow_dq_{};
-  std::array<int, max_joints> regime_{};
+  detail::Regime regime_{};
   std::array<double, stride> x_{};
   std::array<double, static_cast<std::size_t>(stride* stride)> P_{};
   bool started_ = false;

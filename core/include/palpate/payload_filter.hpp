@@ -4,6 +4,7 @@
 
 #include "palpate/check.hpp"
 #include "palpate/kalman.hpp"
+#include "palpate/payload.hpp"
 
 namespace palpate {
 
@@ -46,7 +47,8 @@ class PayloadFilter {
         config_(config),
         loads_(config.first_moment ? 4 : 1),
         biases_(has_coulomb(arm) ? arm.n() : 0),
-        filter_(arm.n(), loads_, biases_ > 0, has_rounding(arm)) {
+        filter_(arm.n(), loads_, biases_ > 0, has_rounding(arm)),
+        unit_(detail::load_basis(arm)) {
     if (!arm.has_dynamics()) throw std::invalid_argument("PayloadFilter: the arm has no masses; give inertials");
     if (std::isnan(config.mass_prior_std)) config_.mass_prior_std = holdable_mass(arm);
     check::positive("PayloadFilterConfig mass_prior_std [kg]", config_.mass_prior_std);
@@ -60,11 +62,6 @@ class PayloadFilter {
     check::positive("PayloadFilterConfig max_step [s]", config.max_step);
     check::positive("PayloadFilterConfig ok_relative [1]", config.ok_relative);
     check::positive("PayloadFilterConfig ok_absolute [kg]", config.ok_absolute);
-    const Vec3<double> c = arm.p_last_grasp();
-    unit_[0] = about_origin(1.0, c, Sym3<double>{});
-    const Mat3<double> R = arm.R_last_tip();
-    const std::array<Vec3<double>, 3> axes{R.cx, R.cy, R.cz};
-    for (std::size_t k = 0; k < 3; ++k) unit_[k + 1] = {0.0, axes[k], parallel_axis(axes[k], c)};
     for (int i = 0; i < arm.n(); ++i)
       torque_variance_[u(i)] = arm.torque_variance(i) + config.model_torque_std * config.model_torque_std;
     decay_.fill(1.0);
@@ -177,23 +174,11 @@ class PayloadFilter {
     return std * std;
   }
   void redraw_bias(int i, double variance) noexcept { filter_.set_parameter(loads_ + i, 0.0, variance); }
-  /// -1, 0, +1 with hysteresis: the state of motion whose friction error stays the same.
-  int regime(int i, double dq) const noexcept {
-    const double v0 = arm_->joint(i).friction.sign_velocity;
-    const int before = regime_[u(i)];
-    const double threshold = before == 0 ? 1.25 * v0 : 0.75 * v0;
-    return dq > threshold ? 1 : dq < -threshold ? -1 : 0;
-  }
-
   void predict(const JointSample& s, double h) noexcept {
     const double phi = std::exp(-h / config_.friction_time);
     for (int i = 0; i < biases_; ++i) {
       const double dq = filter_.dq(i), variance = bias_variance(i, dq);
-      const int now = regime(i, dq);
-      if (now != regime_[u(i)]) {
-        regime_[u(i)] = now;
-        redraw_bias(i, variance);
-      }
+      if (regime_.changed(*arm_, i, dq)) redraw_bias(i, variance);
       decay_[u(loads_ + i)] = phi;
     }
     JointVector variance = torque_variance_;
@@ -318,10 +303,10 @@ class PayloadFilter {
   PayloadFilterConfig config_;
   int loads_, biases_;
   Filter filter_;
-  std::array<Inertia<double>, 4> unit_{};
+  std::array<Inertia<double>, 4> unit_;
   JointVector torque_variance_{};
   Filter::Parameters decay_{};
-  std::array<int, max_joints> regime_{};
+  detail::Regime regime_{};
   std::array<Hypothesis, 12> hypotheses_;
   bool started_ = false;
   std::uint32_t changes_ = 0;

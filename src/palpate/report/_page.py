@@ -51,7 +51,8 @@ border-top:2.5px solid var(--tone)}}
 .narrow,.key.narrow{{display:none}}
 .scroll{{overflow-x:auto}}
 table{{border-collapse:collapse;font-size:.93rem;font-variant-numeric:tabular-nums;margin:.4rem 0}}
-th,td{{text-align:left;padding:.32em 1.4em .32em 0;border-bottom:1px solid var(--grid);vertical-align:top}}
+th,td{{text-align:left;padding:.32em 1.4em .32em 0;overflow-wrap:break-word;
+border-bottom:1px solid var(--grid);vertical-align:top}}
 th{{font-weight:600}}thead th{{color:var(--muted);font-weight:500;font-size:.85rem}}
 tbody th{{min-width:9em}}td.n,th.n{{text-align:right}}td.n{{white-space:nowrap}}
 .yes,.no{{font-weight:650;white-space:nowrap}}.yes{{color:var(--green)}}.no{{color:var(--red)}}
@@ -67,7 +68,9 @@ table{{font-size:.84rem}}th,td{{padding-right:.7em}}tbody th{{min-width:7em}}
 }}
 @media print{{
 @page{{size:A4;margin:13mm}}
-body{{padding:0;max-width:none;font-size:10.5pt}}
+body{{padding:0;max-width:none;font-size:9.5pt}}
+.number{{font-size:2.6rem}}.card{{padding:14px 18px}}.facts{{grid-template-columns:repeat(4,auto)}}
+h2{{margin-top:1.3rem}}
 .panels{{grid-template-columns:repeat(3,1fr);gap:2px 8px}}
 svg.fig{{min-width:0!important}}
 .card,.pill{{print-color-adjust:exact;-webkit-print-color-adjust:exact}}
@@ -107,7 +110,7 @@ def read(text: str) -> str:
 def key(entries: Sequence[tuple[str, str, str]], *, narrow: bool = False) -> str:
     """Names of curves: (name, colour of the palette, "line", "dash", "dots" or "area") each."""
     items = "".join(
-        f'<li><i class="{kind}" style="--tone:var(--{colour})"></i>{escape(name, 80)}</li>'
+        f'<li><i class="{kind}" style="--tone:var(--{colour})"></i>{escape(name, 160)}</li>'
         for name, colour, kind in entries
     )
     return f'<ul class="key{" narrow" * narrow}">{items}</ul>'

@@ -11,37 +11,44 @@ Array = npt.NDArray[np.float64]
 
 GAP_FACTOR = 3.0
 """a spacing beyond this many medians is a gap, as in palpate.logs"""
+_ABSURD = 1e100
 _VISIBLE = 0.003
 """a gap shorter than this share of the whole time cannot be seen"""
+
+
+def finite(values: npt.ArrayLike) -> Array:
+    """A float64 copy with NaN for what is not finite, or so large that drawing it would overflow."""
+    array = np.array(values, dtype=np.float64)
+    array[~(np.abs(array) < _ABSURD)] = np.nan
+    return array
 
 
 def envelope(x: Array, y: Array, limit: int) -> tuple[Array, Array]:
     """At most about `limit` points of the line y(x) that look the same: each bucket's extremes, in their order.
 
-    A bucket with values that are not finite keeps one of them, so that the line breaks there. x, y: (N,).
+    A bucket with NaN keeps one, so that the line breaks there. x, y: (N,); see :func:`finite`.
     """
     n = len(y)
     if n <= limit:
-        return x, np.where(np.isfinite(y), y, np.nan)
-    finite = np.isfinite(y)
-    buckets = max((limit - 2) // (2 if finite.all() else 3), 1)
+        return x, y
+    known = np.isfinite(y)
+    buckets = max((limit - 2) // (2 if known.all() else 3), 1)
     width = -(-n // buckets)
     buckets = -(-n // width)
     start = np.arange(buckets) * width
-    good = _fold(finite, width, False)
-    bad = _fold(~finite, width, False)
+    good = _fold(known, width, False)
+    bad = _fold(~known, width, False)
     low = start + np.where(good, _fold(y, width, 0.0), np.inf).argmin(axis=1)
     high = start + np.where(good, _fold(y, width, 0.0), -np.inf).argmax(axis=1)
     some = good.any(axis=1)
     keep = np.unique(
         np.concatenate(([0, n - 1], low[some], high[some], (start + bad.argmax(axis=1))[bad.any(axis=1)]))
     )
-    return x[keep], np.where(finite, y, np.nan)[keep]
+    return x[keep], y[keep]
 
 
 def band(x: Array, low: Array, high: Array, limit: int) -> tuple[Array, Array, Array]:
     """At most `limit` columns of the band low..high over x, none narrower than the band was. All (N,)."""
-    low, high = (np.where(np.isfinite(a), a, np.nan) for a in (low, high))
     n = len(x)
     if n <= limit:
         return x, low, high
@@ -68,11 +75,16 @@ def break_at_gaps(x: Array, *columns: Array) -> tuple[Array, ...]:
 
 def alone(y: Array) -> npt.NDArray[np.intp]:
     """Indices of finite values without a finite neighbour: a line would not show them."""
-    finite = np.isfinite(y)
-    beside = np.zeros_like(finite)
-    beside[1:] |= finite[:-1]
-    beside[:-1] |= finite[1:]
-    return np.flatnonzero(finite & ~beside)
+    known = np.isfinite(y)
+    return np.flatnonzero(known & ~beside(known))
+
+
+def beside(chosen: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """(N,) True where a neighbour is chosen."""
+    result = np.zeros_like(chosen)
+    result[1:] |= chosen[:-1]
+    result[:-1] |= chosen[1:]
+    return result
 
 
 def limits(values: list[Array]) -> tuple[float, float]:

@@ -31,7 +31,7 @@ def escape(text: object, limit: int = _LONGEST) -> str:
 
 
 def number(value: object, digits: int = 4) -> str:
-    """A number in a few significant digits, with a true minus; anything else as its text; None: a dash."""
+    """A number in at least `digits` significant digits, with a true minus; others as their text; None: a dash."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -39,10 +39,18 @@ def number(value: object, digits: int = 4) -> str:
     if isinstance(value, int):
         return f"{value}".replace("-", "−")
     if isinstance(value, float):  # numpy's float64 is one
-        return "–" if math.isnan(value) else f"{value:.{digits}g}".replace("-", "−").replace("inf", "∞")
+        return "–" if math.isnan(value) else _plain(value, digits).replace("-", "−").replace("inf", "∞")
     if isinstance(value, list | tuple) and len(value) <= 64:
         return ", ".join(number(v, digits) for v in value)
     return clean(value)
+
+
+def _plain(value: float, digits: int) -> str:
+    """Without an exponent where people would not write one."""
+    if not 1e-4 <= abs(value) < 1e7:
+        return f"{value:.{digits}g}"
+    text = f"{value:.{max(digits - 1 - math.floor(math.log10(abs(value))), 0)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
 
 
 def mass_unit(values: Iterable[float]) -> tuple[float, str]:

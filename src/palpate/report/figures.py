@@ -68,7 +68,8 @@ def _line(ax: Axes, x: Array, y: Array, points: int, **style: Any) -> None:
     ax.plot(x, y, **style)
     lone = _series.alone(y)
     if lone.size:
-        ax.plot(x[lone], y[lone], linestyle="none", marker=".", markersize=4, color=style["color"])
+        dots = {k: style[k] for k in ("color", "alpha") if k in style}
+        ax.plot(x[lone], y[lone], linestyle="none", marker=".", markersize=4, **dots)
 
 
 def _band(ax: Axes, x: Array, low: Array, high: Array, points: int, **style: Any) -> None:
@@ -290,17 +291,23 @@ def _draw_mass(
     ends: list[tuple[float, str, str]] = []
     curves: list[tuple[Array, Array, str]] = []
 
-    def curve(y: Array, name: str, **style: Any) -> None:
-        _line(ax, time, np.clip(y * factor, low - far, high + far), points, **style)
-        curves.append((time, y * factor, style["color"]))
-        finite = np.flatnonzero(np.isfinite(y))
-        if finite.size:
-            ends.append((float(y[finite[-1]]) * factor, name, style["color"]))
+    def draw(y: Array, where: npt.NDArray[np.bool_], **style: Any) -> None:
+        _line(ax, time, np.where(where, np.clip(y * factor, low - far, high + far), np.nan), points, **style)
+
+    def name_end(y: Array, name: str, colour: str) -> None:
+        curves.append((time, y * factor, colour))
+        known = np.flatnonzero(np.isfinite(y))
+        if known.size:
+            ends.append((float(y[known[-1]]) * factor, name, colour))
 
     for index, (name, other) in enumerate(report.others.items()):
-        curve(other, name, **{**line_style("", index), "linewidth": 1.1 * thick})
-    ours = "palpate ± 95 %" if np.isfinite(std).any() else "palpate"
-    curve(mass, ours, color=LIGHT["blue"], linewidth=1.5 * thick)
+        style = line_style("", index)
+        draw(other, np.isfinite(other), color=style["color"], linewidth=1.1 * thick)
+        name_end(other, name, style["color"])
+    ok = report.status == 0
+    draw(mass, ~ok | _series.beside(~ok), color=LIGHT["blue"], linewidth=0.7 * thick, alpha=0.5)
+    draw(mass, ok, color=LIGHT["blue"], linewidth=1.5 * thick)
+    name_end(mass, "palpate ± 95 %" if np.isfinite(std).any() else "palpate", LIGHT["blue"])
     if report.truth_known:
         corners, values = _truth_steps(report)
         ax.plot(
@@ -376,7 +383,7 @@ def _draw_close_up(ax: Axes, main: Axes, report: WeighReport, factor: float, uni
 
 
 def _per_joint(value: npt.ArrayLike, shape: tuple[int, int] | None, what: str) -> Array:
-    array = np.asarray(value, dtype=np.float64)
+    array = _series.finite(value)
     if array.ndim != 2 or (shape is not None and array.shape != shape):
         expected = "(N, n)" if shape is None else str(shape)
         raise InputError(f"{what} must have shape {expected}, got {array.shape}")
@@ -415,7 +422,9 @@ def joints_figure(
         MissingExtraError: matplotlib is not installed.
     """
     n = len(joint_names)
-    time = np.asarray(time_s, dtype=np.float64)
+    time = _series.finite(time_s)
+    if time.ndim != 1 or np.isnan(time).any():
+        raise InputError(f"time_s must be finite and of shape (N,), got shape {time.shape}")
     lines = {name: _per_joint(v, (len(time), n), f"curve {name!r:.80}") for name, v in curves.items()}
     deviation = None if std is None else _per_joint(std, (len(time), n), "std")
     units = [unit] * n if isinstance(unit, str) else list(unit)
@@ -463,11 +472,15 @@ def joints_figure(
                 drawn.append((time, values[:, joint], style["color"]))
             _off_scale(ax, drawn, clean(units[joint], 12))
             _ticks(ax, 6, 4)
-            ax.set_title(clean(name, 34), loc="left", parse_math=False)
+            short = _short(name, 36 if notes is None else 22)
+            ax.set_title(
+                short, loc="left", y=1.0, parse_math=False
+            )  # y given: not searched for, much quicker
             if notes is not None:
                 ax.set_title(
                     clean(notes[joint], 60),
                     loc="right",
+                    y=1.0,
                     fontsize="small",
                     color=LIGHT["muted"],
                     parse_math=False,
@@ -477,6 +490,12 @@ def joints_figure(
         if key:
             _key(figure, list(lines), deviation is not None)
         return figure
+
+
+def _short(name: str, limit: int) -> str:
+    """A name cut in the middle: joints often differ at the end."""
+    text = clean(name)
+    return text if len(text) <= limit else f"{text[: limit // 3]}…{text[-(limit - limit // 3 - 1) :]}"
 
 
 def _middle(value: Array, half: Array) -> tuple[Array, Array]:
@@ -621,8 +640,7 @@ def coverage_figure(error: npt.ArrayLike, std: npt.ArrayLike) -> Figure:
         InputError: shapes differ, or a standard deviation is not positive.
         MissingExtraError: matplotlib is not installed.
     """
-    errors = np.asarray(error, dtype=np.float64)
-    spread = np.asarray(std, dtype=np.float64)
+    errors, spread = _series.finite(error), _series.finite(std)
     if errors.ndim != 1 or errors.shape != spread.shape:
         raise InputError(
             f"error and std must have the same shape (M,), got {errors.shape} and {spread.shape}"

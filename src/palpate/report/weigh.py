@@ -127,7 +127,7 @@ def _facts(report: WeighReport, mass: float, std: float, factor: float, unit: st
 
 
 def _signed(value: float, digits: int) -> str:
-    text = number(float(f"{value:.{digits}g}"), digits)
+    text = number(value, digits)
     return text if text.startswith("−") or value == 0.0 else f"+{text}"
 
 
@@ -149,8 +149,8 @@ def _mass(report: WeighReport) -> str:
     text = (
         "The line is the estimated mass, the shade around it holds the truth in 95 of 100 cases if the model is right; "
         "the close-up shows our estimate once settled, at a scale at which that shade has a width. "
-        "The strip below the time axis is the status of every moment, and where it is not ok the picture is tinted: "
-        "do not use the number there."
+        "The strip below the time axis is the status of every moment; where it is not ok the picture is tinted and the "
+        "line is pale: do not use the number there."
     )
     if len(np.asarray(report.changes)):
         text += " Dotted lines: the estimator found that an object was taken or released."

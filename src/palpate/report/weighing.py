@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from palpate.errors import InputError
 
-from ._series import Array
+from ._series import Array, finite
 
 _JOINT_SERIES = (
     "q_measured",
@@ -30,9 +30,9 @@ _JOINT_SERIES = (
 
 
 def _series(value: Any, shape: tuple[int, ...] | None, what: str, *, low: float | None = None) -> Array:
-    """A read-only float64 copy of the stated shape (None: any); it may hold NaN but nothing below `low`."""
+    """A read-only float64 copy of the stated shape (None: any), NaN for what is no number, nothing below `low`."""
     try:
-        array = np.array(value, dtype=np.float64)
+        array = finite(value)
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{what} must be numbers, got {value!r:.80}") from None
     if shape is not None and array.shape != shape:

@@ -5,6 +5,43 @@
 
 namespace palpate {
 
+namespace detail {
+
+/// A torque residual through a second-order Butterworth low-pass, with the variance that is left of its noise.
+class ResidualFilter {
+ public:
+  ResidualFilter(const Arm& arm, double cutoff) : arm_(&arm), cutoff_(cutoff), low_pass_(Butterworth::from_rad_per_s(2, cutoff), arm.n()) {}
+
+  /// One residual [N m] of variance noise [N^2 m^2], white; friction_fraction of the friction's error stays whole.
+  void step(const JointSample& s, const JointVector& residual, const JointVector& noise, double friction_fraction) noexcept {
+    low_pass_.step(residual, s.dt);
+    elapsed_ += s.dt;
+    const double share = std::min(1.0, 0.5 * 1.11 * cutoff_ * s.dt);  // noise bandwidth, 1.11 w_c for order 2, against the sampling
+    for (int j = 0; j < arm_->n(); ++j) {
+      const double friction = arm_->joint(j).friction.uncertainty(s.dq[at(j)], friction_fraction);
+      variance_[at(j)] = share * noise[at(j)] + friction * friction;
+    }
+  }
+  /// After a gap: what was before it is past.
+  void restart() noexcept {
+    low_pass_.reset();
+    elapsed_ = 0.0;
+  }
+  ExternalTorque report(Status status) const noexcept {
+    if (status == Status::ok && elapsed_ * cutoff_ < 4.0) status = Status::warming;
+    return detail::report(arm_->n(), low_pass_.value(), variance_, status);
+  }
+
+ private:
+  const Arm* arm_;
+  double cutoff_;
+  HeldButterworth<> low_pass_;
+  JointVector variance_{};
+  double elapsed_ = 0.0;
+};
+
+}  // namespace detail
+
 struct InverseDynamicsConfig {
   double cutoff = 30.0;            ///< of the second-order Butterworth low-pass on the residual [rad/s]
   double friction_fraction = 0.3;  ///< error of the friction model in motion, part of Coulomb friction [1]
@@ -15,15 +52,13 @@ struct InverseDynamicsConfig {
 class InverseDynamicsObserver {
  public:
   explicit InverseDynamicsObserver(const Arm& arm, const InverseDynamicsConfig& config = {})
-      : arm_(&arm),
-        config_(config),
-        low_pass_(Butterworth::from_rad_per_s(2, check::positive("InverseDynamicsConfig cutoff [rad/s]", config.cutoff)), arm.n()) {
+      : arm_(&arm), config_(config), filter_(arm, check::positive("InverseDynamicsConfig cutoff [rad/s]", config.cutoff)) {
     if (!arm.has_dynamics()) throw std::invalid_argument("InverseDynamicsObserver: the arm has no masses; give inertials");
     check::not_negative("InverseDynamicsConfig friction_fraction [1]", config.friction_fraction);
   }
 
   ExternalTorque step(const JointSample& s) noexcept {
-    if (detail::unusable(s)) return report(Status::held);
+    if (detail::unusable(s)) return filter_.report(Status::held);
     const bool continues = started_ && s.dt > 0.0 && s.status != Status::gap;
     if (continues && s.status != Status::warming) {
       const int n = arm_->n();
@@ -34,46 +69,32 @@ class InverseDynamicsObserver {
         dq[u] = 0.5 * (s.dq[u] + dq_[u]);
         ddq[u] = (s.dq[u] - dq_[u]) / s.dt;
       }
-      JointVector residual = inverse_dynamics<double>(*arm_, q, dq, ddq);
+      JointVector residual = inverse_dynamics<double>(*arm_, q, dq, ddq), noise{};
       const JointVector& p_variance = noise_.variance(*arm_, s);
+      const double wdt = std::min(1.0, config_.cutoff * s.dt);  // the low-pass takes this much of a difference of white noise
       for (int j = 0; j < n; ++j) {
         const auto u = detail::at(j);
         residual[u] += arm_->joint(j).friction.torque(dq[u]) - s.tau[u];
-        // Noise bandwidth of the filter, 1.11 w_c for order 2, against the sampling rate.
-        const double share = std::min(1.0, 0.5 * 1.11 * config_.cutoff * s.dt);
-        const double wdt = std::min(1.0, config_.cutoff * s.dt);
-        const double friction = arm_->joint(j).friction.uncertainty(s.dq[u], config_.friction_fraction);
-        variance_[u] = share * (arm_->torque_variance(j) + 2.0 * p_variance[u] / (s.dt * s.dt) * wdt * wdt) + friction * friction;
+        noise[u] = arm_->torque_variance(j) + 2.0 * p_variance[u] * (wdt / s.dt) * (wdt / s.dt);
       }
-      low_pass_.step(residual, s.dt);
-      elapsed_ += s.dt;
+      filter_.step(s, residual, noise, config_.friction_fraction);
     } else if (!continues) {
-      elapsed_ = 0.0;
+      filter_.restart();
     }
     q_ = s.q;
     dq_ = s.dq;
     started_ = true;
-    if (s.status != Status::ok) return report(s.status);
-    return report(elapsed_ * config_.cutoff < 4.0 ? Status::warming : Status::ok);
+    return filter_.report(s.status);
   }
 
   void reset() { *this = InverseDynamicsObserver(*arm_, config_); }
 
  private:
-  ExternalTorque report(Status status) const noexcept {
-    ExternalTorque out;
-    out.torque = low_pass_.value();
-    for (int j = 0; j < arm_->n(); ++j) out.std[detail::at(j)] = std::sqrt(variance_[detail::at(j)]);
-    out.status = status;
-    return out;
-  }
-
   const Arm* arm_;
   InverseDynamicsConfig config_;
-  HeldButterworth<> low_pass_;
+  detail::ResidualFilter filter_;
   detail::MomentumNoise noise_{};
-  JointVector q_{}, dq_{}, variance_{};
-  double elapsed_ = 0.0;
+  JointVector q_{}, dq_{};
   bool started_ = false;
 };
 
@@ -87,45 +108,28 @@ struct ModelResidualConfig {
 class ModelResidualObserver {
  public:
   explicit ModelResidualObserver(const Arm& arm, const ModelResidualConfig& config = {})
-      : arm_(&arm),
-        config_(config),
-        low_pass_(Butterworth::from_rad_per_s(2, check::positive("ModelResidualConfig cutoff [rad/s]", config.cutoff)), arm.n()) {
+      : arm_(&arm), config_(config), filter_(arm, check::positive("ModelResidualConfig cutoff [rad/s]", config.cutoff)) {
     check::not_negative("ModelResidualConfig friction_fraction [1]", config.friction_fraction);
   }
 
   ExternalTorque step(const JointSample& s) noexcept {
-    if (detail::unusable(s) || !s.has_model_torque) return report(Status::held);
-    if (s.status == Status::gap) low_pass_.reset(), elapsed_ = 0.0;
-    JointVector residual{};
+    if (detail::unusable(s) || !s.has_model_torque) return filter_.report(Status::held);
+    if (s.status == Status::gap) filter_.restart();
+    JointVector residual{}, noise{};
     for (int j = 0; j < arm_->n(); ++j) {
-      const auto u = detail::at(j);
-      residual[u] = s.model_torque[u] - s.tau[u];
-      const double share = std::min(1.0, 0.5 * 1.11 * config_.cutoff * s.dt);
-      const double friction = arm_->joint(j).friction.uncertainty(s.dq[u], config_.friction_fraction);
-      variance_[u] = share * arm_->torque_variance(j) + friction * friction;
+      residual[detail::at(j)] = s.model_torque[detail::at(j)] - s.tau[detail::at(j)];
+      noise[detail::at(j)] = arm_->torque_variance(j);
     }
-    low_pass_.step(residual, s.dt);
-    elapsed_ += s.dt;
-    if (s.status != Status::ok) return report(s.status);
-    return report(elapsed_ * config_.cutoff < 4.0 ? Status::warming : Status::ok);
+    filter_.step(s, residual, noise, config_.friction_fraction);
+    return filter_.report(s.status);
   }
 
   void reset() { *this = ModelResidualObserver(*arm_, config_); }
 
  private:
-  ExternalTorque report(Status status) const noexcept {
-    ExternalTorque out;
-    out.torque = low_pass_.value();
-    for (int j = 0; j < arm_->n(); ++j) out.std[detail::at(j)] = std::sqrt(variance_[detail::at(j)]);
-    out.status = status;
-    return out;
-  }
-
   const Arm* arm_;
   ModelResidualConfig config_;
-  HeldButterworth<> low_pass_;
-  JointVector variance_{};
-  double elapsed_ = 0.0;
+  detail::ResidualFilter filter_;
 };
 
 static_assert(DisturbanceObserver<InverseDynamicsObserver>);

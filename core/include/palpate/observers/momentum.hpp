@@ -58,13 +58,7 @@ class MomentumObserver {
   void reset() { *this = MomentumObserver(*arm_, config_); }
 
  private:
-  ExternalTorque report(Status status) const noexcept {
-    ExternalTorque out;
-    out.torque = r_;
-    for (int j = 0; j < arm_->n(); ++j) out.std[detail::at(j)] = std::sqrt(variance_[detail::at(j)]);
-    out.status = status;
-    return out;
-  }
+  ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), r_, variance_, status); }
 
   const Arm* arm_;
   MomentumConfig config_;

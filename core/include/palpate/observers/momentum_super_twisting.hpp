@@ -76,13 +76,7 @@ class MomentumSuperTwisting {
   void reset() { *this = MomentumSuperTwisting(*arm_, config_); }
 
  private:
-  ExternalTorque report(Status status) const noexcept {
-    ExternalTorque out;
-    out.torque = z_;
-    for (int j = 0; j < arm_->n(); ++j) out.std[detail::at(j)] = std::sqrt(variance_[detail::at(j)]);
-    out.status = status;
-    return out;
-  }
+  ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), z_, variance_, status); }
 
   const Arm* arm_;
   SuperTwistingConfig config_;

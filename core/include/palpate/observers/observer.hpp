@@ -21,6 +21,15 @@ inline bool unusable(const JointSample& s) noexcept {
   return s.status == Status::non_finite || s.status == Status::time_error;
 }
 
+/// An external torque with variances and status as the struct that travels on.
+inline ExternalTorque report(int n, const JointVector& torque, const JointVector& variance, Status status) noexcept {
+  ExternalTorque out;
+  out.torque = torque;
+  for (int j = 0; j < n; ++j) out.std[at(j)] = std::sqrt(variance[at(j)]);
+  out.status = status;
+  return out;
+}
+
 /// Standard deviation of the generalised momentum p = M q' from that of q' [N m s], with the inertia of a pose nearby:
 /// M is refreshed once a joint has moved by 0.1 rad, so that a step stays one sweep.
 class MomentumNoise {

@@ -200,13 +200,7 @@ class SlidingModeObserver {
     }
   }
 
-  ExternalTorque report(Status status) const noexcept {
-    ExternalTorque out;
-    out.torque = torque_;
-    for (int j = 0; j < arm_->n(); ++j) out.std[detail::at(j)] = std::sqrt(variance_[detail::at(j)]);
-    out.status = status;
-    return out;
-  }
+  ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), torque_, variance_, status); }
 
   const Arm* arm_;
   SlidingModeConfig config_;

@@ -1,0 +1,101 @@
+"""Published results reproduced, and palpate's own claims measured: one module per study.
+
+>>> from palpate.studies import STUDIES
+>>> result = STUDIES["payload-filter"].run(quick=True)  # doctest: +SKIP
+>>> [(row.what, row.ours) for row in result.rows]  # doctest: +SKIP
+
+Studies run on two processes, started by ``spawn``: a script that runs one needs ``if __name__ == "__main__":``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+from ..report.study import StudyRow as Row
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["STUDIES", "Progress", "Row", "Study", "StudyResult"]
+
+Progress: TypeAlias = Callable[[int, int, float], None]
+"""called with (jobs done, jobs in all, seconds left by present pace; infinite until one is done)"""
+
+
+@dataclass(frozen=True, slots=True)
+class StudyResult:
+    """What a study found."""
+
+    name: str
+    title: str
+    rows: tuple[Row, ...]
+    """what was published or is required, and what was measured; ``ok`` None: for information"""
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+    """matplotlib figures by caption, in order; none if matplotlib is not installed"""
+    notes: tuple[str, ...] = ()
+    """how it was measured, and what surprised; one sentence or more each"""
+    seconds: float = 0.0
+    """how long it took [s]"""
+
+    @property
+    def ok(self) -> bool:
+        """No row misses."""
+        return all(row.ok is not False for row in self.rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """A study by name; its module is imported when it runs."""
+
+    name: str
+    title: str
+    verb: Literal["reproduce", "bench"]
+    """the command it belongs to: ``palpate reproduce NAME`` or ``palpate bench NAME``"""
+    module: str = ""
+    """within palpate.studies; empty: the name with underscores"""
+
+    def run(self, progress: Progress | None = None, quick: bool = False) -> StudyResult:
+        """Measure.
+
+        Args:
+            progress: told after every job how far it is.
+            quick: few repetitions, to see that it works. The rows then say so and judge nothing.
+
+        Raises:
+            MissingExtraError: the study needs an extra, mostly ``sim``.
+        """
+        module = importlib.import_module(f"{__name__}.{self.module or self.name.replace('-', '_')}")
+        begin = time.perf_counter()
+        rows, figures, notes = module.run(progress or _silent, quick)
+        if quick:
+            rows = [replace(row, ok=None, note=f"quick run, not comparable; {row.note}".rstrip("; ")) for row in rows]
+            notes = ["Quick run: fewer repetitions than the figures ask for; no row is judged.", *notes]
+        return StudyResult(
+            self.name, self.title, tuple(rows), figures, tuple(notes), time.perf_counter() - begin
+        )
+
+
+def _silent(done: int, total: int, seconds_left: float) -> None:
+    """Progress that nobody wants to see."""
+
+
+_ALL = (
+    Study("mass-estimation", "The published mass estimation with a sliding-mode observer", "reproduce"),
+    Study("lara8", "A real NEURA LARA8 weighs 5.26 kg by its motor currents", "reproduce"),
+    Study("payload-filter", "The payload Kalman filter on the published bench", "bench"),
+    Study("unknown-grasp", "The object is not held where it was thought", "bench"),
+    Study("wrong-masses", "The arm's links do not weigh what the model says", "bench"),
+    Study("grasp-and-release", "An object is taken and dropped at unknown times", "bench"),
+    Study("feedback", "What is weighed is fed back to the controller", "bench"),
+    Study("box-inertias", "The same arm with inertias a body can have", "bench"),
+    Study("replay", "Live, offline, replayed, chunked: the same bits; import time and size", "bench"),
+    Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
+)
+
+STUDIES: Mapping[str, Study] = MappingProxyType({study.name: study for study in _ALL})
+"""every study by name"""

@@ -1,0 +1,158 @@
+"""The Cramér-Rao bound of the mass: no unbiased estimator's standard deviation can be smaller."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..arm import Arm, Array
+from ..simulate import Load
+
+FIRST_EXIT_MEDIAN = 0.757858
+"""median of the time at which a Brownian motion first leaves [-1, 1]"""
+
+
+def holding(arm: Arm, load: Load, mass: float | None = None) -> Arm:
+    """The arm with the object as a part of its last link; `mass` [kg] instead of the object's, its inertia kept."""
+    m = load.mass if mass is None else mass
+    R, p = arm.T_last_tip[:3, :3], arm.T_last_tip[:3, 3]
+    c = R @ (arm.grasp + np.asarray(load.com)) + p
+    last = arm.joints[-1]
+    total = last.mass + m
+    com = (last.mass * last.com + m * c) / total
+    inertia = last.inertia + R @ np.asarray(load.inertia) @ R.T
+    for body, at in ((last.mass, last.com - com), (m, c - com)):
+        inertia = inertia + body * (at @ at * np.eye(3) - np.outer(at, at))
+    inertia = 0.5 * (inertia + inertia.T)
+    return arm.replace(joints=(*arm.joints[:-1], last.replace(mass=total, com=com, inertia=inertia)))
+
+
+def transitions(
+    arm: Arm, load: Load, q: Array, dq: Array, torque: Array, period: float, *, substeps: int = 1
+) -> Array:
+    """How small changes of (q, q', m) at one sample change (q, q', m) at the next, along a motion.
+
+    Args:
+        arm: without the object.
+        load: what it holds.
+        q: (N, n) true [rad].
+        dq: (N, n) true [rad/s].
+        torque: (N, n) applied in the period that ended at the sample [N m].
+        period: [s].
+        substeps: parts of a period in which the Jacobian is taken to be constant.
+
+    Returns:
+        (N-1, 2n+1, 2n+1). The equations of motion are differentiated by central differences at the middle of each
+        part, and integrated over it by the matrix exponential.
+    """
+    n = arm.n
+    full = holding(arm, load)
+    step = 1e-3 * load.mass
+    lighter, heavier = holding(arm, load, load.mass - step), holding(arm, load, load.mass + step)
+
+    def acceleration(model: Arm, x: Array, v: Array) -> Array:
+        return model.forward_dynamics(x, v, tau - model.friction_torque(v))
+
+    tau = torque[1:]
+    x, v = q[:-1], dq[:-1]
+    h = period / substeps
+    total = np.broadcast_to(np.eye(2 * n + 1), (len(tau), 2 * n + 1, 2 * n + 1))
+    for _ in range(substeps):
+        x, v = _runge_kutta(full, acceleration, x, v, 0.5 * h)
+        F = np.zeros_like(total)
+        F[:, :n, n : 2 * n] = np.eye(n)
+        for j in range(n):
+            d = np.zeros(n)
+            d[j] = 1e-5
+            F[:, n : 2 * n, j] = (acceleration(full, x + d, v) - acceleration(full, x - d, v)) / 2e-5
+            F[:, n : 2 * n, n + j] = (acceleration(full, x, v + d) - acceleration(full, x, v - d)) / 2e-5
+        F[:, n : 2 * n, 2 * n] = (acceleration(heavier, x, v) - acceleration(lighter, x, v)) / (2.0 * step)
+        total = _exponential(h * F) @ total
+        x, v = _runge_kutta(full, acceleration, x, v, 0.5 * h)
+    return np.ascontiguousarray(total)
+
+
+def _runge_kutta(arm, acceleration, x: Array, v: Array, h: float) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+    a1 = acceleration(arm, x, v)
+    v2 = v + 0.5 * h * a1
+    a2 = acceleration(arm, x + 0.5 * h * v, v2)
+    v3 = v + 0.5 * h * a2
+    a3 = acceleration(arm, x + 0.5 * h * v2, v3)
+    v4 = v + h * a3
+    a4 = acceleration(arm, x + h * v3, v4)
+    return x + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+
+
+def _exponential(A: Array) -> Array:
+    """exp of each (k, k) matrix of A (N, k, k): scaled, Taylor's series of order 8, squared."""
+    norm = float(np.abs(A).sum(axis=2).max())
+    squarings = max(0, math.ceil(math.log2(max(norm, 1e-300) / 0.1)))
+    B = A / 2.0**squarings
+    term = np.broadcast_to(np.eye(A.shape[1]), A.shape)
+    result = term.copy()
+    for k in range(1, 9):
+        term = term @ B / k
+        result += term
+    for _ in range(squarings):
+        result = result @ result
+    return result
+
+
+def mass_std(
+    transition: Array, position_std: Array, *, mass_prior_std: float, velocity_prior_std: float
+) -> Array:
+    """Bound of the mass's standard deviation after each sample, (N,) [kg].
+
+    For white Gaussian noise of the positions, torques known, nothing disturbed, and the stated knowledge of mass and
+    velocity before the first sample; the start position is not known.
+
+    Args:
+        transition: (N-1, 2n+1, 2n+1) of :func:`transitions`.
+        position_std: (n,) noise of a position [rad].
+        mass_prior_std: [kg].
+        velocity_prior_std: [rad/s].
+    """
+    n = len(position_std)
+    H = np.eye(n, 2 * n + 1)
+    R = np.diag(np.square(position_std))
+    P = np.diag(np.concatenate((np.full(n, 1.0), np.full(n, velocity_prior_std**2), [mass_prior_std**2])))
+    out = np.empty(len(transition) + 1)
+    eye = np.eye(2 * n + 1)
+    for k in range(len(out)):
+        if k:
+            P = transition[k - 1] @ P @ transition[k - 1].T
+        K = np.linalg.solve(P[:n, :n] + R, P[:n]).T
+        left = eye - K @ H
+        P = left @ P @ left.T + K @ R @ K.T  # Joseph's form: stays symmetric and positive
+        out[k] = math.sqrt(P[-1, -1])
+    return out
+
+
+def settling_time(time: Array, std: Array, bound: float) -> float:
+    """Median time after which an efficient estimator's error stays within +-bound for good [s]; infinite if it never does.
+
+    The error of an estimator that reaches the bound at every moment is a Brownian motion in its own variance: e(t) = W(P(t)),
+    P falling. Looked at from P = 0 it leaves +-bound for the first time at P = 0.7579 bound^2 in the median.
+    """
+    return crossing(time, np.square(std), FIRST_EXIT_MEDIAN * bound * bound)
+
+
+def crossing(time: Array, falling: Array, level: float) -> float:
+    """When `falling` (N,) first is at or below `level`, between samples by interpolation of its logarithm [s]."""
+    below = np.flatnonzero(falling <= level)
+    if not below.size:
+        return math.inf
+    k = int(below[0])
+    if k == 0:
+        return float(time[0])
+    a, b = math.log(falling[k - 1]), math.log(falling[k])
+    return float(time[k - 1] + (time[k] - time[k - 1]) * (a - math.log(level)) / (a - b))
+
+
+def still_inside(variance: Array, bound: float) -> Array:
+    """Probability that a Brownian motion has not left +-bound until `variance`, (N,)."""
+    s = np.square(np.pi / bound) * np.maximum(variance, 1e-12 * bound * bound) / 8.0
+    k = np.arange(40)[:, None]
+    total = 4.0 / np.pi * ((-1.0) ** k / (2 * k + 1) * np.exp(-np.square(2 * k + 1) * s)).sum(axis=0)
+    return np.where(variance > 0.05 * bound * bound, np.clip(total, 0.0, 1.0), 1.0)

@@ -1,0 +1,34 @@
+"""The application that weighs: a simulated arm, or a log; and the replay of what was recorded."""
+
+from __future__ import annotations
+
+from .replay import Difference, Replay, replay
+from .scenes import Scene, find_pose, load_arm, scene, telling_pose, weight_torque
+from .session import Moment, Session, Task, arm_of, arrival, brick, check_mass, run
+from .weighing import Hold, Weighing, fit_joints, make_pipeline, weigh_log, weigh_session
+
+__all__ = [
+    "Difference",
+    "Hold",
+    "Moment",
+    "Replay",
+    "Scene",
+    "Session",
+    "Task",
+    "Weighing",
+    "arm_of",
+    "arrival",
+    "brick",
+    "check_mass",
+    "find_pose",
+    "fit_joints",
+    "load_arm",
+    "make_pipeline",
+    "replay",
+    "run",
+    "scene",
+    "telling_pose",
+    "weigh_log",
+    "weigh_session",
+    "weight_torque",
+]
