@@ -34,6 +34,9 @@ enum class Job : int {
   forward_dynamics,
 };
 
+/// The payload filters' prior of the mass [kg]: given, since palpate would take it from the arm's torque limits.
+inline constexpr double mass_prior_std = 2.0;
+
 /// What a contestant found for one sample; the contestants must agree.
 struct Numbers {
   int n = 0;

@@ -136,8 +136,9 @@ std::unique_ptr<contest::Entry> ours(const ArmDescription& arm, Job job) {
       return std::make_unique<Timed<Observing<ExtendedKalman, ExtendedKalmanConfig>>>(how, arm, ExtendedKalmanConfig{.disturbance = false});
     case Job::kalman_disturbance:
       return std::make_unique<Timed<Observing<ExtendedKalman, ExtendedKalmanConfig>>>(how, arm, ExtendedKalmanConfig{});
-    case Job::payload_mass: return std::make_unique<Timed<Weighing>>(how, arm, PayloadFilterConfig{});
-    case Job::payload_moment: return std::make_unique<Timed<Weighing>>(how, arm, PayloadFilterConfig{.first_moment = true});
+    case Job::payload_mass: return std::make_unique<Timed<Weighing>>(how, arm, PayloadFilterConfig{.mass_prior_std = contest::mass_prior_std});
+    case Job::payload_moment: return std::make_unique<Timed<Weighing>>(how, arm, 
+                                                PayloadFilterConfig{.first_moment = true, .mass_prior_std = contest::mass_prior_std});
     case Job::inverse_dynamics: return std::make_unique<Timed<InverseDynamics>>(how, arm);
     case Job::mass_matrix: return std::make_unique<Timed<MassMatrix>>(how, arm);
     case Job::forward_dynamics: return std::make_unique<Timed<ForwardDynamics>>(how, arm);

@@ -85,7 +85,7 @@ class DataSet:
             f"Licence: {self.licence_name}\n"
         )
         if self.licence is None:
-            return head + "\nThe authors gave no licence. Use the files for evaluation only and do not pass them on.\n"
+            return head + "\nThe authors gave no licence. Evaluate with the files, and do not pass them on.\n"
         return head + (f"\n{self.licence_text}" if self.licence_text else "")
 
     def url(self, file: DataFile) -> str:
@@ -250,7 +250,9 @@ def get(name: str, *, accept_licence: Consent) -> Path:
         raise MissingExtraError("data", f"downloading data set {name!r}") from None
     accepted = accept_licence(data.terms) if callable(accept_licence) else accept_licence
     if not accepted:
-        raise LogError(f"data set {name!r} was not downloaded: its licence ({data.licence_name}) was not accepted")
+        raise LogError(
+            f"data set {name!r} was not downloaded: its licence ({data.licence_name}) was not accepted"
+        )
     pooch.get_logger().setLevel("WARNING")  # it tells every file otherwise
     folder = _cache(pooch, data)
     for file in data.files:
@@ -258,10 +260,12 @@ def get(name: str, *, accept_licence: Consent) -> Path:
         try:
             pooch.retrieve(url, f"sha256:{file.sha256}", fname=file.name, path=folder)
         except ValueError as error:  # pooch's word for a wrong hash
-            raise LogError(f"{url} is not the file that was published: {str(error).splitlines()[0]}") from error
+            raise LogError(
+                f"{url} is not the file that was published: {str(error).splitlines()[0]}"
+            ) from error
         except OSError as error:  # no network, no such address, no space
-            told = str(error)
-            reason = told if told and len(told) <= 200 else type(error).__name__  # requests tells its whole pool
+            told = str(error)  # of a dead network requests tells its whole pool
+            reason = told if told and len(told) <= 200 else type(error).__name__
             raise LogError(
                 f"{url} cannot be downloaded ({reason}). Without a network, put the files into a folder "
                 f"{data.folder} and let {VARIABLE} name the folder above it"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import os
 import pickle
 import time
 import zipfile
@@ -18,6 +17,7 @@ from hypothesis import strategies as st
 from palpate.errors import InputError, LogError
 from palpate.logs import ColumnMap, Log, SignalColumns, npz, table
 from palpate.logs.table import exact_ns, number
+from recordings import data_folder
 
 HEADER = "time_ns,position_1,position_2,velocity_1,velocity_2,effort_1,effort_2\n"
 TWO = ColumnMap(time=0, time_unit="s", position=(1, 2), effort=(3, 4))
@@ -31,13 +31,6 @@ def write(tmp_path: Path, text: str | bytes, name: str = "log.csv") -> Path:
     path = tmp_path / name
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     return path
-
-
-def data_folder() -> Path:
-    folder = Path(os.environ.get("PALPATE_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
-    if not folder.is_dir():
-        pytest.skip(f"no recorded data in {folder} (set PALPATE_DATA)")
-    return folder
 
 
 # -- columns ----------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 from ..arm import Arm, Array
 from ..simulate import Load
 
-FIRST_EXIT_MEDIAN = 0.757858
+FIRST_EXIT_MEDIAN = 0.757497
 """median of the time at which a Brownian motion first leaves [-1, 1]"""
 
 
@@ -100,7 +100,13 @@ def _exponential(A: Array) -> Array:
 
 
 def mass_std(
-    transition: Array, position_std: Array, *, mass_prior_std: float, velocity_prior_std: float
+    transition: Array,
+    position_std: Array,
+    *,
+    mass_prior_std: float,
+    velocity_prior_std: float,
+    count: Array | None = None,
+    q: Array | None = None,
 ) -> Array:
     """Bound of the mass's standard deviation after each sample, (N,) [kg].
 
@@ -112,20 +118,35 @@ def mass_std(
         position_std: (n,) noise of a position [rad].
         mass_prior_std: [kg].
         velocity_prior_std: [rad/s].
+        count: (n,) of the encoders [rad]: rounding to it as an error of its own, of standard deviation count/sqrt(12), that
+            stays while the joint stands and is another after 0.2 counts of motion. None: rounding is in position_std.
+        q: (N, n) true positions [rad], needed with `count`.
     """
     n = len(position_std)
-    H = np.eye(n, 2 * n + 1)
+    errors = 0 if count is None else n
+    size = 2 * n + 1 + errors
+    H = np.eye(n, size)
+    H[:, 2 * n + 1 :] = np.eye(n, errors)
     R = np.diag(np.square(position_std))
-    P = np.diag(np.concatenate((np.full(n, 1.0), np.full(n, velocity_prior_std**2), [mass_prior_std**2])))
+    rounding = np.zeros(0) if count is None else np.square(count) / 12.0
+    P = np.diag(
+        np.concatenate(
+            (np.full(n, 1.0), np.full(n, velocity_prior_std**2), [mass_prior_std**2], rounding)
+        )
+    )
     out = np.empty(len(transition) + 1)
-    eye = np.eye(2 * n + 1)
+    F, eye, old = np.eye(size), np.eye(size), slice(2 * n + 1, size)
     for k in range(len(out)):
         if k:
-            P = transition[k - 1] @ P @ transition[k - 1].T
-        K = np.linalg.solve(P[:n, :n] + R, P[:n]).T
+            F[: 2 * n + 1, : 2 * n + 1] = transition[k - 1]
+            if count is not None and q is not None:
+                F[old, old] = np.diag(np.exp(-np.abs(q[k] - q[k - 1]) / (0.2 * count)))
+            P = F @ P @ F.T
+            P[old, old] += np.diag((1.0 - np.square(np.diag(F)[old])) * rounding)
+        K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
         left = eye - K @ H
         P = left @ P @ left.T + K @ R @ K.T  # Joseph's form: stays symmetric and positive
-        out[k] = math.sqrt(P[-1, -1])
+        out[k] = math.sqrt(P[2 * n, 2 * n])
     return out
 
 
@@ -133,7 +154,7 @@ def settling_time(time: Array, std: Array, bound: float) -> float:
     """Median time after which an efficient estimator's error stays within +-bound for good [s]; infinite if it never does.
 
     The error of an estimator that reaches the bound at every moment is a Brownian motion in its own variance: e(t) = W(P(t)),
-    P falling. Looked at from P = 0 it leaves +-bound for the first time at P = 0.7579 bound^2 in the median.
+    P falling. Looked at from P = 0 it leaves +-bound for the first time at P = 0.7575 bound^2 in the median.
     """
     return crossing(time, np.square(std), FIRST_EXIT_MEDIAN * bound * bound)
 

@@ -36,6 +36,7 @@ def curves(
     *,
     level: tuple[float, str] | None = None,
     marks: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None = None,
+    band: tuple[Array, Array, Array] | None = None,
     limits: tuple[float, float, float, float] | None = None,
     log: bool = False,
     across: str = "time [s]",
@@ -47,6 +48,7 @@ def curves(
         label: of the vertical axis, with unit.
         level: a horizontal line and its name.
         marks: points by name.
+        band: x, lower and upper edge, in the first curve's colour.
         limits: left, right, bottom, top.
         log: vertical axis logarithmic.
         across: label of the horizontal axis.
@@ -57,6 +59,9 @@ def curves(
         figure = Figure(figsize=(8.4, 3.4), layout="constrained")
         ax = figure.add_subplot()
         _plot(ax, lines, log)
+        if band is not None:
+            x, low, high = (values[:: max(1, len(values) // _POINTS)] for values in band)
+            ax.fill_between(x, low, high, color=colour(0), alpha=0.2, linewidth=0.0)
         if level is not None:
             ax.axhline(level[0], color=LIGHT["ink"], linewidth=0.8, linestyle=(0, (4, 3)), label=level[1])
         for name, (x, y) in (marks or {}).items():

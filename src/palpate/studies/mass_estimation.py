@@ -339,9 +339,9 @@ def _draw(
     for kind, caption, state in ((0, "positions (figure 9)", touch.q), (1, "speeds (figure 10)", touch.dq)):
         true = motion.position if kind == 0 else motion.dq
         curves = {
+            "measured": true,  # of the speeds: the plant's
             "sliding mode": state,
             "Kalman, published": filtered[:, kind],
-            "measured" if kind == 0 else "simulated": true,
             "desired": motion.wanted[:, kind],
         }
         figures[f"Joint {caption} on the way to the published goal"] = joints_figure(

@@ -65,7 +65,9 @@ def pipeline_of(log: Log, arm: Arm) -> Pipeline:
     """
     text = log.meta.get("pipeline")
     if text is None:
-        raise LogError("the log does not say which pipeline it was made with: no recording of palpate weigh or simulate")
+        raise LogError(
+            "the log does not say which pipeline it was made with: no recording of palpate weigh or simulate"
+        )
     try:
         options = json.loads(text)
     except ValueError as error:
@@ -135,7 +137,9 @@ def replay(log: Log) -> Replay:
                 )
             )
     if not names:
-        raise LogError("the log holds no recorded outputs to compare with: no recording of palpate weigh or simulate")
+        raise LogError(
+            "the log holds no recorded outputs to compare with: no recording of palpate weigh or simulate"
+        )
     return Replay(
         arm,
         touch,

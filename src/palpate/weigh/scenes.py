@@ -30,8 +30,10 @@ _KATANA_POSES = {"goal": (0.0, 0.5, -0.5, 0.0, 0.0)}
 _JUSTINA_KP = (5.0, 2.5, 2.5, 2.5, 2.5, 2.5, 2.5)
 _JUSTINA_KD = (3.5, 1.0, 1.0, 1.5, 1.0, 1.0, 1.0)
 
-_BANDWIDTH = 8.0
+_BANDWIDTH = 10.0
 """of the controller of an arm without published gains [rad/s]"""
+_ROTOR = 500.0
+"""assumed of a drive: its torque limit over its reflected rotor inertia [1/s^2]"""
 _ENCODER = 2.0 * math.pi / 65536.0
 """resolution assumed of an encoder that nobody described: 16 bit [rad]"""
 NOISE_COUNTS = 2
@@ -76,18 +78,21 @@ _REFERENCES = {
     "katana_450_6m90a": _Reference(_KATANA_POSES, "goal", 0.1),
     "kuka_lbr_iiwa7": _Reference({}, None, 2.0),
     "kuka_lbr_iiwa14": _Reference({}, None, 2.0),
-    "abb_irb2400_16": _Reference({}, None, 10.0),
+    "abb_irb2400_16": _Reference({}, None, 20.0),
 }
 _UNKNOWN = _Reference({}, None, 0.25)
 
 
-def load_arm(source: str, *, base: str | None = None, tip: str | None = None) -> Arm:
+def load_arm(
+    source: str, *, base: str | None = None, tip: str | None = None, repair_inertia: bool = False
+) -> Arm:
     """An arm by the name of a reference arm, or out of a card (.yaml, .yml) or a URDF (.urdf, .xacro, .xml).
 
     Args:
         source: name or path.
         base: base link in a URDF; None: as :meth:`palpate.Arm.from_urdf`.
         tip: tip link in a URDF; None: as :meth:`palpate.Arm.from_urdf`.
+        repair_inertia: as :meth:`palpate.Arm.from_urdf`.
 
     Raises:
         ArmError: no such arm, or the file describes none.
@@ -101,7 +106,9 @@ def load_arm(source: str, *, base: str | None = None, tip: str | None = None) ->
     kind = path.suffix.lower()
     if kind not in (".yaml", ".yml", ".urdf", ".xacro", ".xml"):
         if path.exists():
-            raise ArmError(f"{source}: an arm is a card (.yaml) or a URDF (.urdf, .xacro), not {kind or 'this'}")
+            raise ArmError(
+                f"{source}: an arm is a card (.yaml) or a URDF (.urdf, .xacro), not {kind or 'this'}"
+            )
         raise ArmError(
             f"no arm {source!r}: neither a file nor a reference arm; "
             f"{suggest(source, robots.names(), 'reference arms')}"
@@ -112,7 +119,7 @@ def load_arm(source: str, *, base: str | None = None, tip: str | None = None) ->
         return Arm.from_card(path)
     if not path.exists():
         raise ArmError(f"{source}: no such file")
-    return Arm.from_urdf(path, base=base, tip=tip)
+    return Arm.from_urdf(path, base=base, tip=tip, repair_inertia=repair_inertia)
 
 
 def scene(arm: Arm, *, mass: float | None = None) -> Scene:
@@ -132,7 +139,7 @@ def scene(arm: Arm, *, mass: float | None = None) -> Scene:
     if len(poses) < len(reference.poses):  # another arm of the same name
         reference, poses = _UNKNOWN, {}
     heaviest = max(reference.mass, mass or 0.0)
-    arm, assumed = _complete(arm, heaviest)
+    arm, assumed = _complete(arm, heaviest, published=reference.kp is not None)
     start = next((name for name in poses if name.lower() == "zero"), "zero")
     lower, upper = _limits(arm)
     if start not in poses:
@@ -218,7 +225,8 @@ def telling_pose(arm: Arm, mass: float) -> Array:
     can be told)^2, angles rounded to 0.1 rad. The same arm gives the same pose.
     """
     lower, upper = _limits(arm)
-    low, high = np.maximum(lower, -1.2), np.minimum(upper, 1.2)
+    # not at the limits, where the safety limiter brakes
+    low, high = np.maximum(lower + 0.2, -1.2), np.minimum(upper - 0.2, 1.2)
     low, high = np.minimum(low, upper), np.maximum(high, lower)
     draws = np.random.default_rng(0).random((512, arm.n))
     q = np.clip(np.round(low + draws * (high - low), 1), lower, upper)
@@ -249,8 +257,11 @@ def _vector(values: object) -> Array:
     return array
 
 
-def _complete(arm: Arm, mass: float) -> tuple[Arm, tuple[str, ...]]:
-    """The arm with a declared effort, torque limits and encoders, and what was assumed for that."""
+def _complete(arm: Arm, mass: float, *, published: bool) -> tuple[Arm, tuple[str, ...]]:
+    """The arm with a declared effort, torque limits, rotors and encoders, and what was assumed for that.
+
+    A published bench stays as it was published.
+    """
     assumed = []
     if arm.effort.kind == "undeclared":
         arm = arm.replace(effort=Effort.torque())
@@ -263,6 +274,7 @@ def _complete(arm: Arm, mass: float) -> tuple[Arm, tuple[str, ...]]:
         static = np.abs(arm.gravity_torque(q)) + 2.0 * mass * np.abs(np.einsum("k,nkj->nj", arm.gravity, J))
         inertia = np.diagonal(arm.mass_matrix(q), axis1=1, axis2=2) + mass * np.sum(J * J, axis=1)
         most = np.max(1.5 * static + 10.0 * inertia, axis=0) + [j.friction.coulomb for j in arm.joints]
+        most = np.maximum(most, 0.05 * np.max(most))
         joints = []
         for joint, torque in zip(arm.joints, most, strict=True):
             effort = joint.limits.effort if math.isfinite(joint.limits.effort) else float(f"{torque:.2g}")
@@ -273,6 +285,13 @@ def _complete(arm: Arm, mass: float) -> tuple[Arm, tuple[str, ...]]:
         arm = arm.replace(joints=tuple(joints))
         assumed.append(
             "Torque limits that the arm's description does not state were taken from its weight and inertia."
+        )
+    if not published and not any(j.rotor_inertia for j in arm.joints):
+        joints = [j.replace(rotor_inertia=j.limits.effort / _ROTOR) for j in arm.joints]
+        arm = arm.replace(joints=tuple(joints))
+        assumed.append(
+            "Rotor inertias that the arm's description does not state were taken from the torque limits: "
+            f"{1e3 / _ROTOR:g} g m^2 per N m."
         )
     if any(j.sensing == Sensing() for j in arm.joints):
         joints = []

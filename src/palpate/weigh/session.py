@@ -292,7 +292,7 @@ def _record(recorder: Recorder, moment: Moment, sent: Array, gain: Array, plant:
     recorder.external_torque(time_ns, external.torque, external.std)
     recorder.payload(time_ns, payload.mass, payload.mass_std)
     recorder.status(time_ns, sample=touch.status, external_torque=external.status, payload=payload.status)
-    values = (
+    values: tuple[npt.ArrayLike, ...] = (
         touch.q,
         touch.dq,
         payload.first_moment,
@@ -397,7 +397,9 @@ def run(
             if picture:
                 try:
                     drawn = driver.plant.render()
-                except PalpateError as e:  # a weighing without a picture is one all the same; the caller tells why
+                except (
+                    PalpateError
+                ) as e:  # a weighing without a picture is one all the same; the caller tells why
                     error = str(e)
     finally:
         if recorder is not None:

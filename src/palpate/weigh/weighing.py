@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from ..arm import Arm, Array
 from ..errors import ArmError, InputError, suggest
 from ..logs import Log
 from ..pipeline import ESTIMATORS, OBSERVERS, Pipeline, Touch
+from .noise import describe_noise
 from .scenes import Scene, telling_pose, weight_torque
 from .session import Session, Task, arm_of, arrival
 
@@ -120,11 +121,18 @@ class Weighing:
 
     @property
     def change_times(self) -> Array:
-        """(C,) when the estimator found that an object was taken or released [s]."""
-        changes = self.touch.payload.changes.astype(np.int64)
-        rows = np.flatnonzero(np.diff(changes, prepend=0) > 0)
-        first = int(self.log.time_ns[0]) if len(self.log) else 0
-        return np.array((self.touch.payload.change_time_ns[rows] - first) * 1e-9, dtype=np.float64)
+        """(C,) when the estimator found that an object was taken or released [s].
+
+        What it took for one before it had ever known a mass was its own start, and is left out.
+        """
+        payload = self.touch.payload
+        rows = np.flatnonzero(np.diff(payload.changes.astype(np.int64), prepend=0) > 0)
+        known = np.flatnonzero(payload.status == int(Status.ok))
+        if not rows.size or not known.size:
+            return np.empty(0)
+        times = payload.change_time_ns[rows]
+        times = times[times > int(self.log.time_ns[known[0]])]
+        return np.array((times - int(self.log.time_ns[0])) * 1e-9, dtype=np.float64)
 
     @property
     def holds(self) -> tuple[Hold, ...]:
@@ -134,7 +142,7 @@ class Weighing:
         time, payload = self.time, self.touch.payload
         edges = [float(time[0]), *self.change_times.tolist(), float(time[-1])]
         found = []
-        for start, stop in zip(edges, edges[1:], strict=False):
+        for start, stop in pairwise(edges):
             before = np.flatnonzero(time < stop) if stop < edges[-1] else np.array([len(time) - 1])
             row = int(before[-1]) if before.size else 0
             found.append(
@@ -317,7 +325,9 @@ def make_pipeline(
                 )
             )
     if observer == "model-residual" and not model_torque:
-        raise InputError("observer 'model-residual' needs samples with the controller's own model torque; there is none")
+        raise InputError(
+            "observer 'model-residual' needs samples with the controller's own model torque; there is none"
+        )
     estimator = estimator or "payload-filter"
     chosen = None
     if observer != "none" and (observer or arm.has_dynamics):
@@ -339,7 +349,7 @@ def make_pipeline(
 
 
 def _observer_options(arm: Arm, name: str) -> dict[str, Any]:
-    """What an observer must know of this arm's size: external torque changes by a tenth of what the drives can, in 1 s."""
+    """What an observer must know of this arm: in 1 s external torque changes by a tenth of what the drives can."""
     effort = float(np.median([j.limits.effort for j in arm.joints]))
     if name == "extended-kalman" and math.isfinite(effort):
         return {"disturbance_rate": 0.1 * effort}
@@ -384,7 +394,7 @@ def weigh_session(session: Session, *, pose: str = "", scene: Scene | None = Non
 
 
 def _arrived(session: Session) -> tuple[float, tuple[bool, str] | None]:
-    """Largest distance of a joint from the goal [rad]; if torque limits hold the arm back: whether it fails, in words."""
+    """Largest distance of a joint from the goal [rad]; if torque limits hold it back: whether it fails, in words."""
     task, log = session.task, session.log
     truth = log.signals["true_position"].value
     goal = task.poses[-1]
@@ -398,7 +408,9 @@ def _arrived(session: Session) -> tuple[float, tuple[bool, str] | None]:
     arm = task.scene.arm
     limits = np.array([j.limits.effort for j in arm.joints])
     full = np.mean(np.abs(session.command[last]) > 0.98 * limits, axis=0) > 0.5
-    names = ", ".join(f"{j.name} ({j.limits.effort:g} N m)" for j, f in zip(arm.joints, full, strict=True) if f)
+    names = ", ".join(
+        f"{j.name} ({j.limits.effort:g} N m)" for j, f in zip(arm.joints, full, strict=True) if f
+    )
     start = task.poses[-2] if len(task.poses) > 1 else task.start
     reach = max(0.5 * float(np.linalg.norm(goal - start)), 0.4)
     failed = float(np.linalg.norm(away)) > reach
@@ -463,12 +475,13 @@ def _why(result: Weighing, scene: Scene | None) -> list[str]:
         name, most = ",".join(f"{x:g}" for x in q), float(np.max(weight_torque(arm, q)))
     if seen < 0.3 * most:
         return [
-            f"The pose hides the weight: a kilogram puts at most {seen:.2g} N m on a joint here, and {most:.2g} N m in pose "
-            f"{name}. Weigh there" + (f": --pose {name}." if result.task is not None else ".")
+            f"The pose hides the weight: a kilogram puts at most {seen:.2g} N m on a joint here, and {most:.2g} N m in "
+            f"pose {name}. Weigh there" + (f": --pose {name}." if result.task is not None else ".")
         ]
     half = TWO_SIDED_95 * result.mass_std
     return [
-        f"Friction, noise or too short a time leave ± {half:.2g} kg (95 %): weigh longer, or move the arm while it weighs."
+        f"Friction, noise or too short a time leave ± {half:.2g} kg (95 %): weigh longer, or move the arm while it "
+        "weighs."
     ]
 
 
@@ -498,14 +511,19 @@ def weigh_log(
     log, note = fit_joints(log, arm)
     remarks += note
     unit = log.meta.get("effort_unit", "")
-    if (unit == "A") != (arm.effort.kind == "current") and unit in ("A", "N m") and arm.effort.kind != "undeclared":
+    if (
+        (unit == "A") != (arm.effort.kind == "current")
+        and unit in ("A", "N m")
+        and arm.effort.kind != "undeclared"
+    ):
         raise InputError(
             f"the log's effort is in {unit}, but arm {arm.name!r} declares {arm.effort.kind}: "
             "one of them is wrong (effort of the card, or effort_unit of the columns)"
         )
-    pipeline, decided = make_pipeline(
-        arm, estimator, observer, model_torque=log.model_torque is not None
-    )
+    if arm.effort.kind != "undeclared":
+        arm, said = describe_noise(arm, log)
+        remarks += [said] if said else []
+    pipeline, decided = make_pipeline(arm, estimator, observer, model_torque=log.model_torque is not None)
     remarks += decided
     touch = pipeline.run(log)
     result = Weighing(
@@ -516,19 +534,13 @@ def weigh_log(
         status=Status(int(touch.payload.status[-1])) if len(log) else Status.warming,
         truth=_truth(log),
         desired=_setpoints(log),
-        pose=_recorded_pose(log),
     )
     bad = int(np.count_nonzero(np.isin(touch.status, [int(Status.non_finite), int(Status.time_error)])))
     if bad:
-        remarks.append(f"{bad} of {len(log)} samples were not used: NaN, absurd numbers or times that do not rise.")
+        remarks.append(
+            f"{bad} of {len(log)} samples were not used: NaN, absurd numbers or times that do not rise."
+        )
     return replace(result, remarks=(*_why(result, None), *remarks))
-
-
-def _recorded_pose(log: Log) -> str:
-    try:
-        return str(json.loads(log.meta.get("task", "{}")).get("pose", ""))
-    except (ValueError, AttributeError):  # somebody else's "task"
-        return ""
 
 
 def _setpoints(log: Log) -> tuple[Array, Array] | None:

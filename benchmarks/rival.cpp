@@ -4,69 +4,15 @@
 // parser's choice for other axes is slower by up to 10 %); crba in the LOCAL, aba in the WORLD convention, each its faster
 // one; header-only, so that everything is inlined (slower by up to 15 % from the compiled library); joint-space matrices of
 // fixed size 7. What is not dynamics (friction, low-pass) is palpate's own code, compiled with this file's flags.
-#include <pinocchio/algorithm/aba-derivatives.hpp>
-#include <pinocchio/algorithm/aba.hpp>
-#include <pinocchio/algorithm/crba.hpp>
-#include <pinocchio/algorithm/kinematics.hpp>
-#include <pinocchio/algorithm/rnea-derivatives.hpp>
-#include <pinocchio/algorithm/rnea.hpp>
-#include <pinocchio/multibody.hpp>
-#include <stdexcept>
-#include <string>
-
-#include "contest.hpp"
 #include "palpate/observers/momentum.hpp"
 #include "palpate/observers/sliding_mode.hpp"
+#include "rival.hpp"
+#include "rival_kalman.hpp"
 
 namespace {
 
-namespace pin = pinocchio;
+using namespace rival;
 using contest::Job;
-using contest::Numbers;
-using palpate::Arm;
-using palpate::JointSample;
-using palpate::JointVector;
-
-constexpr int N = 7;
-using Vector = Eigen::Matrix<double, N, 1>;
-using Square = Eigen::Matrix<double, N, N>;
-using Factor = Eigen::LLT<Square, Eigen::Upper>;  // crba fills the upper triangle
-
-Eigen::Map<const Vector> in(const JointVector& x) { return Eigen::Map<const Vector>(x.data()); }
-Eigen::Vector3d vector3(const palpate::Vec3<double>& a) { return {a.x, a.y, a.z}; }
-std::size_t u(int i) { return static_cast<std::size_t>(i); }
-
-pin::Inertia inertia(const palpate::Inertia<double>& b) {
-  const Eigen::Vector3d c = vector3(b.mc) / b.m;
-  Eigen::Matrix3d I;
-  I << b.I.xx, b.I.xy, b.I.xz, b.I.xy, b.I.yy, b.I.yz, b.I.xz, b.I.yz, b.I.zz;
-  return {b.m, c, I - b.m * (c.squaredNorm() * Eigen::Matrix3d::Identity() - c * c.transpose())};
-}
-
-pin::Model model_of(const Arm& arm) {
-  if (arm.n() != N) throw std::invalid_argument("the rival's matrices are made for 7 joints");
-  pin::Model model;
-  pin::JointIndex parent = 0;
-  for (int j = 0; j < N; ++j) {
-    const palpate::Body& b = arm.body(j);
-    if (b.prismatic) throw std::invalid_argument("the rival is made for revolute joints");
-    Eigen::Matrix3d R;
-    R << vector3(b.R.cx), vector3(b.R.cy), vector3(b.R.cz);
-    parent = model.addJoint(parent, pin::JointModelRZ(), pin::SE3(R, vector3(b.p)), "joint " + std::to_string(j + 1));
-    model.appendBodyToJoint(parent, inertia(b.inertia));
-    model.armature[j] = b.rotor_inertia;
-  }
-  model.gravity.linear() = vector3(arm.gravity());
-  return model;
-}
-
-/// Everything a job needs of the arm.
-struct Rival {
-  explicit Rival(const palpate::ArmDescription& description) : arm(description), model(model_of(arm)), data(model) {}
-  Arm arm;
-  pin::Model model;
-  pin::Data data;
-};
 
 // --- dynamics ----------------------------------------------------------------------------------------------------
 
@@ -300,6 +246,45 @@ class SlidingMode {
   Vector x1_ = Vector::Zero(), x2_ = Vector::Zero(), side_ = Vector::Zero(), torque_ = Vector::Zero(), std_ = Vector::Zero();
 };
 
+/// The ways to run a filter, each timed.
+template <template <Derivatives, Update> class Filter, class... Args>
+void enter_filters(contest::Entries* entries, const palpate::ArmDescription& arm, Args... args) {
+  using enum Derivatives;
+  using enum Update;
+  const auto enter = [&]<class Work>(std::type_identity<Work>, const char* how) {
+    entries->push_back(std::make_unique<contest::Timed<Work>>(how, arm, args...));
+  };
+  enter(std::type_identity<Filter<newton_euler, one_by_one>>{}, "computeRNEADerivatives, one by one");
+  enter(std::type_identity<Filter<newton_euler, all_at_once>>{}, "computeRNEADerivatives, all at once");
+  enter(std::type_identity<Filter<articulated_body, one_by_one>>{}, "computeABADerivatives, one by one");
+  enter(std::type_identity<Filter<articulated_body, all_at_once>>{}, "computeABADerivatives, all at once");
+}
+
+template <Derivatives d, Update u>
+using Smoother = rival::ExtendedKalman<false, d, u>;
+template <Derivatives d, Update u>
+using Observer = rival::ExtendedKalman<true, d, u>;
+/// The payload filter's sizes for what an arm has.
+template <int loads, bool torques, bool encoders>
+struct Sizes {
+  template <Derivatives d, Update u>
+  using Filter = rival::PayloadFilter<loads, torques, encoders, d, u>;
+};
+
+template <int loads>
+void enter_payload_filters(contest::Entries* entries, const palpate::ArmDescription& arm) {
+  bool torques = false, encoders = false;
+  for (int i = 0; i < arm.n; ++i) {
+    torques = torques || arm.joints[u(i)].friction.uncertainty(0.0, 0.0) > 0.0;
+    encoders = encoders || arm.joints[u(i)].position_resolution > 0.0;
+  }
+  const double prior = contest::mass_prior_std;
+  if (torques && encoders) enter_filters<Sizes<loads, true, true>::template Filter>(entries, arm, prior);
+  else if (torques) throw std::invalid_argument("no rival for an arm with dry friction and exact encoders");
+  else if (encoders) enter_filters<Sizes<loads, false, true>::template Filter>(entries, arm, prior);
+  else enter_filters<Sizes<loads, false, false>::template Filter>(entries, arm, prior);
+}
+
 }  // namespace
 
 /// The rival's ways of doing a job, each timed.
@@ -315,12 +300,15 @@ extern "C" void PALPATE_RIVAL(const palpate::ArmDescription* arm, Job job, conte
       break;
     case Job::sliding_mode: enter(std::type_identity<SlidingMode>{}, "crba, 4 nonLinearEffects, LLT", 1); break;
     case Job::sliding_mode_twice: enter(std::type_identity<SlidingMode>{}, "crba, 8 nonLinearEffects, LLT", 2); break;
+    case Job::kalman: enter_filters<Smoother>(entries, *arm); break;
+    case Job::kalman_disturbance: enter_filters<Observer>(entries, *arm); break;
+    case Job::payload_mass: enter_payload_filters<1>(entries, *arm); break;
+    case Job::payload_moment: enter_payload_filters<4>(entries, *arm); break;
     case Job::inverse_dynamics: enter(std::type_identity<InverseDynamics>{}, "rnea"); break;
     case Job::mass_matrix: enter(std::type_identity<MassMatrix>{}, "crba"); break;
     case Job::forward_dynamics:
       enter(std::type_identity<ForwardDynamics>{}, "aba");
       enter(std::type_identity<ForwardDynamicsByCholesky>{}, "crba, nonLinearEffects, LLT");
       break;
-    default: break;
   }
 }

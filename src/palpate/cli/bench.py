@@ -1,0 +1,33 @@
+"""``palpate bench``: palpate's own claims, measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from ._common import Json, Quiet, examples
+from ._study import List, Names, Out, Quick
+from ._study import run as run_studies
+
+
+def add(app: typer.Typer) -> None:
+    """Make the verb known."""
+    app.command(
+        "bench",
+        help="Measure what palpate claims.\n\n"
+        "Writes a page, a Markdown table and JSON per study. Exit code 1 if a row misses.",
+        epilog=examples("palpate bench --list", "palpate bench payload-filter", "palpate bench --quick"),
+    )(run)
+
+
+def run(
+    names: Names = None,
+    out: Out = Path("results"),
+    quick: Quick = False,
+    listing: List = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Bench."""
+    return run_studies("bench", names, out=out, quick=quick, listing=listing, json=json, quiet=quiet)

@@ -1,0 +1,294 @@
+"""``palpate weigh``: what does the arm hold?"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ..errors import InputError
+from . import STOPPED
+from ._common import (
+    Base,
+    Columns,
+    Effort,
+    Json,
+    Quiet,
+    Repair,
+    Tip,
+    check_target,
+    console,
+    emit,
+    examples,
+    is_recording,
+    is_report,
+    make_folder,
+    mass_text,
+    open_arm,
+    open_log,
+    picture_png,
+    print_rows,
+    say,
+    status_words,
+)
+
+if TYPE_CHECKING:
+    from ..weigh import Session, Task, Weighing
+
+_DEFAULT_ARM = "justina_left_arm"
+
+
+def add(app: typer.Typer) -> None:
+    """Make the verb known."""
+    app.command(
+        "weigh",
+        help="Weigh what an arm holds, without a force sensor.\n\n"
+        "Without LOG a simulated arm lifts an object from rest to a grasping pose, with noise and quantisation. "
+        "With LOG the same is done for a recording of a real arm. Writes run.mcap (simulation only) and report.html "
+        "into the current folder; both replace those of an earlier run.",
+        epilog=examples(
+            "palpate weigh",
+            "palpate weigh --mass 0.4 --pose StandBy --seed 7",
+            "palpate weigh --arm kuka_lbr_iiwa7 --out /tmp/iiwa --json",
+            "palpate weigh task.mcap --arm robot.arm.yaml",
+            "palpate weigh log.csv --columns columns.yaml --arm robot.urdf --tip tool0 --effort torque",
+        ),
+    )(run)
+
+
+def run(
+    log: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="LOG",
+            help="A recording: .mcap, rosbag2 folder, .csv, .npz. Without it an arm is simulated.",
+            show_default=False,
+        ),
+    ] = None,
+    arm: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ARM",
+            help=f"Name of a reference arm (see palpate arm), a card or a URDF. [default: {_DEFAULT_ARM}, or "
+            "the one palpate recorded in LOG]",
+            show_default=False,
+        ),
+    ] = None,
+    mass: Annotated[
+        float | None,
+        typer.Option(metavar="KG", help="Mass to lift. [default: 0.25 for Justina]", show_default=False),
+    ] = None,
+    pose: Annotated[
+        str | None,
+        typer.Option(
+            metavar="POSE",
+            help="Pose to weigh in: a name (Take3, StandBy, ...) or angles in rad, separated by commas. "
+            "[default: Take3 for Justina]",
+            show_default=False,
+        ),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(metavar="POSE", help="Pose to start from. [default: zero]", show_default=False),
+    ] = None,
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="payload-filter, regression or joint-formula. [default: payload-filter]",
+            show_default=False,
+        ),
+    ] = None,
+    observer: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Where the external torque comes from: extended-kalman, momentum, super-twisting, sliding-mode, "
+            "inverse-dynamics, model-residual or none. [default: extended-kalman]",
+            show_default=False,
+        ),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(metavar="N", help="Of the simulated noise; the same seed gives the same run.")
+    ] = 0,
+    duration: Annotated[float, typer.Option(metavar="S", help="How long to simulate.")] = 10.0,
+    noise: Annotated[
+        bool, typer.Option("--noise/--no-noise", help="Noise and quantisation of the drives.")
+    ] = True,
+    speed: Annotated[
+        float | None,
+        typer.Option(
+            metavar="X",
+            help="Simulated seconds per second. [default: 2 with the live table, else as fast as it goes]",
+            show_default=False,
+        ),
+    ] = None,
+    columns: Columns = None,
+    effort: Effort = None,
+    base: Base = None,
+    tip: Tip = None,
+    repair: Repair = False,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files.")] = Path(),
+    record: Annotated[bool, typer.Option("--record/--no-record", help="Write run.mcap.")] = True,
+    report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Weigh."""
+    from .. import weigh as weighing
+
+    if log is not None:
+        given = {"--mass": mass, "--pose": pose, "--start": start, "--speed": speed}
+        _only("a simulation", "LOG is a recording", given)
+    else:
+        _only("a LOG", "nothing is recorded yet", {"--columns": columns, "--effort": effort})
+    page = out / "report.html"
+    if report:
+        make_folder(out)
+        check_target(page, is_report, "the report")
+    files: dict[str, str] = {}
+    picture = None
+    live = not (json or quiet) and console().is_terminal
+
+    if log is not None:
+        model = None if arm is None else open_arm(arm, base=base, tip=tip, repair=repair, effort=effort)
+        result = weighing.weigh_log(open_log(log, columns), model, estimator=estimator, observer=observer)
+        title = f"What {result.arm.name} holds in {log.name}"
+    else:
+        if mass is not None:
+            weighing.check_mass(mass)
+        scene = weighing.scene(open_arm(arm or _DEFAULT_ARM, base=base, tip=tip, repair=repair), mass=mass)
+        name, goal = weighing.find_pose(scene, pose or scene.pose)
+        held = scene.mass if mass is None else mass
+        task = weighing.Task(
+            scene=scene,
+            start=weighing.find_pose(scene, start or scene.start)[1],
+            poses=(goal,),
+            loads=((0.0, held),),
+            duration=duration,
+            noise=noise,
+            seed=seed,
+            speed=2.0 if live and speed is None else speed,
+        )
+        pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer)
+        target = None
+        if record:
+            target = make_folder(out) / "run.mcap"
+            check_target(target, is_recording, "the recording")
+        session = _session(task, pipeline, target, live=live, pose=name, picture=report)
+        result = weighing.weigh_session(session, pose=name)
+        if target is not None:
+            files["log"] = str(target)
+        if session.picture is not None:
+            picture = picture_png(session.picture)
+        elif session.picture_error and not (json or quiet):
+            say(f"no picture: {session.picture_error}")
+        title = f"{scene.arm.name} weighs {held:g} kg"
+    if report:
+        from ..report import write_weigh_report
+
+        files["report"] = str(write_weigh_report(result.report(title=title, picture=picture), page))
+    if json:
+        emit({**result.summary(), "files": files})
+    elif quiet:
+        say(_short(result))
+    else:
+        _tell(result, files)
+    return STOPPED if result.interrupted else 0
+
+
+def _only(where: str, why: str, given: dict[str, Any]) -> None:
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"{name} is for {where}, and {why}")
+
+
+def _session(
+    task: Task, pipeline: Any, target: Path | None, *, live: bool, pose: str, picture: bool
+) -> Session:
+    from ..weigh import run as run_session
+    from ._live import LiveTable, interruptible
+
+    with interruptible() as stopped:
+        if not live:
+            return run_session(task, pipeline, record=target, stop=stopped, picture=picture)
+        with LiveTable(task, pose) as table:
+            return run_session(
+                task, pipeline, record=target, stop=stopped, progress=table.update, picture=picture
+            )
+
+
+def _short(result: Weighing) -> str:
+    text = f"{mass_text(result.mass, result.mass_std)} (95 %), {result.status.name}"
+    if result.status.name != "ok":
+        return f"{text}: do not use"
+    return text
+
+
+def _tell(result: Weighing, files: dict[str, str]) -> None:
+    """The result for people."""
+    from rich.text import Text
+
+    good = result.status.name == "ok"
+    rows: list[tuple[str, Text | str]] = [("what", _what(result))]
+    mass = Text(mass_text(result.mass, result.mass_std), style="bold" if good else "dim")
+    mass.append(" (95 %)", style="dim" if not good else "")
+    if not good:
+        mass.append("   not to be used", style="bold red")
+    rows.append(("mass", mass))
+    if result.true_mass == result.true_mass:
+        truth = mass_text(result.true_mass, float("nan"))
+        error = result.error_percent
+        rows.append(("truth", truth + (f", error {round(error, 2) + 0.0:+.2f} %" if error == error else "")))
+    status = Text(result.status.name, style="green" if good else "bold red")
+    status.append(f": {status_words(result.status)}", style="")
+    rows.append(("status", status))
+    settled = result.time_to_2_percent
+    if settled == settled:
+        rows.append(("known", _known(result, settled)))
+    times = result.change_times
+    if len(times):
+        rows.append(("changes", _changes(result)))
+    rows.append(
+        ("method", result.method() + (f", seed {result.task.seed}" if result.task is not None else ""))
+    )
+    if result.task is None:
+        repair = str(result.log.repair).splitlines()
+        rows.append(("read", "\n".join(repair)))
+    rows.extend((name, str(path)) for name, path in files.items())
+    print_rows(rows, result.remarks)
+
+
+def _what(result: Weighing) -> str:
+    log = result.log
+    size = f"{len(log)} samples, {log.duration:.3g} s, {log.rate:.3g} Hz"
+    if result.task is None:
+        return f"{result.arm.name}: {size}"
+    thing = "an object" if result.task.mass_at(result.task.duration) > 0.0 else "nothing"
+    return f"{result.arm.name} (simulated) lifts {thing} to pose {result.pose}: {size}"
+
+
+def _known(result: Weighing, settled: float) -> str:
+    if settled == float("inf"):
+        return "not within 2 % of the truth by the end"
+    text = f"within 2 % of the truth for good after {settled:.2f} s"
+    if result.task is not None:
+        from ..weigh import arrival
+
+        stop = arrival(result.task)
+        if settled < stop:
+            text += f", before the arm stopped at {stop:.2f} s"
+    return text
+
+
+def _changes(result: Weighing) -> str:
+    holds = result.holds
+    lines = []
+    for before, after in pairwise(holds):
+        lines.append(
+            f"at {after.start:.2f} s from {mass_text(before.mass, before.mass_std)} "
+            f"to {mass_text(after.mass, after.mass_std)}"
+        )
+    return "\n".join(lines)
