@@ -166,10 +166,11 @@ void bind_pipeline(nb::module_& m) {
                                 {{"first_moment", &RegressionConfig::first_moment, "estimate m and m (c - grasp)"},
                                  {"mass_prior_std", &RegressionConfig::mass_prior_std, "[kg]"},
                                  {"offset_prior_std", &RegressionConfig::offset_prior_std, "of the grasp point [m]"},
-                                 {"lag", &RegressionConfig::lag, "time constant of the observer before it [s]"},
+                                 {"lag", &RegressionConfig::lag, "time constant of the observer before it, NaN: as the pipeline knows it [s]"},
                                  {"acceleration_time", &RegressionConfig::acceleration_time, "time constant of the acceleration [s]"},
                                  {"friction_fraction", &RegressionConfig::friction_fraction, "friction model's error in motion, part of Coulomb friction [1]"},
                                  {"bias_time", &RegressionConfig::bias_time, "how long an error of friction or gain lasts [s]"},
+                                 {"settling_time", &RegressionConfig::settling_time, "a joint that starts, stops or reverses is not used so long [s]"},
                                  {"ok_relative", &RegressionConfig::ok_relative, "status ok below this part of the mass [1]"},
                                  {"ok_absolute", &RegressionConfig::ok_absolute, "or below this [kg]"}});
   bind_config<PayloadFilterConfig>(m, "PayloadFilter", "Payload Kalman filter: state (q, q', m[, m delta]); at rest and in motion (MATH.md section 4).",

@@ -59,6 +59,13 @@ class JointKalman {
   void set_parameter(int i, double mean, double var) noexcept { set(2 * n_ + i, mean, var); }
   void add_variance(int i, double var) noexcept { P_[u(i * dim_ + i)] += var; }
   void add_parameter_variance(int i, double var) noexcept { add_variance(2 * n_ + i, var); }
+  /// Friction as it is on average over the velocities that are possible: the sign is only as sharp as the velocity is known
+  /// (statistical linearisation: tanh(v / v_0) of v ~ N(v, P) is close to tanh(v / sqrt(v_0^2 + P))).
+  Friction expected_friction(const Arm& arm, int i) const noexcept {
+    Friction friction = arm.joint(i).friction;
+    friction.sign_velocity = std::sqrt(friction.sign_velocity * friction.sign_velocity + std::max(variance(n_ + i), 0.0));
+    return friction;
+  }
   /// False once rounding or an absurd input has broken the state: it must then be started anew.
   bool healthy() const noexcept {
     for (int i = 0; i < dim_; ++i)
@@ -99,7 +106,7 @@ class JointKalman {
     JointMatrix W = mass_matrix<double>(arm, q_m, in.load);
     JointVector r{}, slope{};
     for (int i = 0; i < n_; ++i) {
-      const Friction& friction = arm.joint(i).friction;
+      const Friction friction = expected_friction(arm, i);
       slope[u(i)] = friction.derivative(v[u(i)]);
       const double x = h * slope[u(i)] / W(i, i);
       theta_[u(i)] = weight(x);
@@ -227,8 +234,8 @@ class JointKalman {
     for (int i = 0; i < n_; ++i) {
       const JointDescription& d = arm.joint(i);
       const int e = encoder_ >= 0 ? 2 * n_ + encoder_ + i : -1;
-      const double R = e >= 0 ? d.position_std * d.position_std : arm.position_variance(i);
-      seen(i, e, measure(i, e, sample.q[u(i)], std::max(R, least_variance)));
+      // The rounding counts twice, as a state that stays and as noise: it is in truth neither, but a saw-tooth of q.
+      seen(i, e, measure(i, e, sample.q[u(i)], std::max(arm.position_variance(i), least_variance)));
       if (sample.velocity_measured && std::isfinite(d.velocity_std))
         seen(n_ + i, -1, measure(n_ + i, -1, sample.dq[u(i)], std::max(d.velocity_std * d.velocity_std, least_variance)));
     }

@@ -113,10 +113,11 @@ struct RegressionConfig {
   bool first_moment = false;        ///< estimate m and m (c - grasp); else m alone, held exactly at the grasp point
   double mass_prior_std = 20.0;     ///< of the mass before anything is known, about 0 [kg]
   double offset_prior_std = 0.05;   ///< of the grasp point's error, each tip axis [m]
-  double lag = 0.0;                 ///< time constant of the observer before this, applied to the regressor too [s]
+  double lag = std::numeric_limits<double>::quiet_NaN();  ///< of the observer before this, applied to the regressor too [s]; NaN: as Pipeline knows it
   double acceleration_time = 0.05;  ///< time constant of the acceleration in the regressor [s]
   double friction_fraction = 0.3;   ///< error of the friction model in motion, part of Coulomb friction [1]
   double bias_time = 5.0;           ///< how long an error of friction or drive gain stays the same [s]
+  double settling_time = 0.2;       ///< a joint that starts, stops or reverses is not used so long, nor for 5 lags [s]
   double ok_relative = 0.25;        ///< status `ok` once mass_std is below the larger of this part of the mass
   double ok_absolute = 0.05;        ///< and this [kg]
 };
@@ -133,10 +134,12 @@ class Regression {
   explicit Regression(const Arm& arm, const RegressionConfig& config = {}) : arm_(&arm), config_(config), loads_(config.first_moment ? 4 : 1), unit_(detail::load_basis(arm)) {
     check::positive("RegressionConfig mass_prior_std [kg]", config.mass_prior_std);
     check::positive("RegressionConfig offset_prior_std [m]", config.offset_prior_std);
-    check::not_negative("RegressionConfig lag [s]", config.lag);
+    if (std::isnan(config_.lag)) config_.lag = 0.0;
+    check::not_negative("RegressionConfig lag [s]", config_.lag);
     check::not_negative("RegressionConfig acceleration_time [s]", config.acceleration_time);
     check::not_negative("RegressionConfig friction_fraction [1]", config.friction_fraction);
     check::positive("RegressionConfig bias_time [s]", config.bias_time);
+    check::not_negative("RegressionConfig settling_time [s]", config.settling_time);
     check::positive("RegressionConfig ok_relative [1]", config.ok_relative);
     check::positive("RegressionConfig ok_absolute [kg]", config.ok_absolute);
     for (int k = 0; k < loads_; ++k) {
@@ -158,7 +161,8 @@ class Regression {
     const double correlated = s.dt > 0.0 ? std::max(1.0, 2.0 * config_.lag / s.dt) : 1.0;
     for (int j = 0; j < arm_->n(); ++j) {
       const auto u = detail::at(j);
-      measure(j, external.torque[u], correlated * external.std[u] * external.std[u] + 1e-12);
+      if (since_change_[u] < std::max(5.0 * config_.lag, config_.settling_time)) continue;  // the residual still holds what was before
+      measure(j, external.torque[u], correlated * external.noise[u] * external.noise[u] + 1e-12);
     }
     return report(external.status);
   }
@@ -180,12 +184,25 @@ class Regression {
     }
     dq_ = s.dq;
     BaseFrame chain(*arm_, s.q, s.dq);
-    chain.inverse_dynamics(ddq_);
+    chain.inverse_dynamics(without_noise(s, dt));
     const double b = dt > 0.0 && config_.lag > 0.0 ? -std::expm1(-dt / config_.lag) : 1.0;
     for (int k = 0; k < loads_; ++k) {
       const JointVector column = chain.body_torque(arm_->n() - 1, moved(chain.pose().R, chain.pose().p, unit_[u(k)]));
       for (int j = 0; j < arm_->n(); ++j) H_[u(k)][u(j)] += b * (-column[u(j)] - H_[u(k)][u(j)]);
     }
+  }
+
+  /// The acceleration, shrunk by the part of it that is noise: a noisy regressor pulls the mass towards zero, the harder
+  /// the more samples there are.  a (1 - (2 std(a)/a)^2),  std(a) that of the filtered difference of the velocities.
+  JointVector without_noise(const JointSample& s, double dt) const noexcept {
+    JointVector out{};
+    if (!(dt > 0.0)) return out;
+    const double a = config_.acceleration_time > 0.0 ? -std::expm1(-dt / config_.acceleration_time) : 1.0;
+    for (int j = 0; j < arm_->n(); ++j) {
+      const double noise = a / dt * s.dq_std[u(j)] * std::sqrt(2.0 / (2.0 - a)), square = ddq_[u(j)] * ddq_[u(j)];
+      if (square > 4.0 * noise * noise) out[u(j)] = ddq_[u(j)] * (1.0 - 4.0 * noise * noise / square);
+    }
+    return out;
   }
 
   void predict(const JointSample& s, double dt) noexcept {
@@ -199,6 +216,7 @@ class Regression {
       const double gain = d.torque_gain_std * s.tau[u(j)];
       const double variance = rest * rest + gain * gain;
       const double keep = !started_ || changed ? 0.0 : phi;
+      since_change_[u(j)] = started_ && !changed ? since_change_[u(j)] + dt : 0.0;
       const int row = loads_ + j;
       x_[u(row)] *= keep;
       for (int c = 0; c < dim(); ++c) P(row, c) *= keep;
@@ -248,6 +266,7 @@ class Regression {
   std::array<JointVector, 4> H_{};  // d tau_ext / d theta
   JointVector dq_{}, ddq_{}, slow_dq_{};
   detail::Regime regime_{};
+  JointVector since_change_{};  // [s]
   std::array<double, stride> x_{};
   std::array<double, static_cast<std::size_t>(stride* stride)> P_{};
   bool started_ = false;

@@ -26,10 +26,11 @@ struct PayloadFilterConfig {
 
 /// State (q, q', theta, b) with
 ///   M(q; theta) q'' + C q' + g + tau_f = tau + b,   z = q + encoder rounding
-/// theta = m, or (m, m delta) with delta = c - grasp the offset of the load's centre of mass, in tip axes; b the slowly
+/// theta = m, or (m, delta) with delta = c - grasp the offset of the load's centre of mass, in tip axes; b the slowly
 /// varying error of the friction model, one per joint that has Coulomb friction. (MATH.md section 4; kalman.hpp.)
 ///
-/// The load is a point mass at the grasp point plus the first moment m delta: linear in theta but for m |delta|^2.
+/// The load is a point mass at c. delta is a state rather than m delta because that is what is known beforehand: a hand
+/// grasps within some centimetres, whatever the object weighs.
 /// b is a first-order process of standard deviation Friction::uncertainty (wide at rest, where stiction hides any torque
 /// within +-F_c) and time friction_time; a start, a stop and a reversal draw it anew.
 ///
@@ -48,7 +49,7 @@ class PayloadFilter {
         loads_(config.first_moment ? 4 : 1),
         biases_(has_coulomb(arm) ? arm.n() : 0),
         filter_(arm.n(), loads_, biases_ > 0, has_rounding(arm)),
-        unit_(detail::load_basis(arm)) {
+        tip_axis_{arm.R_last_tip().cx, arm.R_last_tip().cy, arm.R_last_tip().cz} {
     if (!arm.has_dynamics()) throw std::invalid_argument("PayloadFilter: the arm has no masses; give inertials");
     if (std::isnan(config.mass_prior_std)) config_.mass_prior_std = holdable_mass(arm);
     check::positive("PayloadFilterConfig mass_prior_std [kg]", config_.mass_prior_std);
@@ -65,6 +66,8 @@ class PayloadFilter {
     for (int i = 0; i < arm.n(); ++i)
       torque_variance_[u(i)] = arm.torque_variance(i) + config.model_torque_std * config.model_torque_std;
     decay_.fill(1.0);
+    surprise_.fill(1.0);
+    model_error_.fill(least_model_error);
     set_load_prior();
     restart_hypotheses();
   }
@@ -78,7 +81,9 @@ class PayloadFilter {
     }
     const int steps = 1 + static_cast<int>(s.dt / config_.max_step);
     for (int k = 0; k < steps; ++k) predict(s, s.dt / steps);
-    filter_.measure_joints(*arm_, s, [this](int i, int e, const Filter::Update& update) {
+    const double smoothing = -std::expm1(-s.dt / 0.3);
+    filter_.measure_joints(*arm_, s, [this, smoothing](int i, int e, const Filter::Update& update) {
+      if (i < arm_->n()) surprise_[u(i)] += smoothing * (std::min(update.y * update.y / update.s, 100.0) - surprise_[u(i)]);
       for (Hypothesis& hyp : hypotheses_) {
         const double seen = hyp.e[u(i)] + (e >= 0 ? hyp.e[u(e)] : 0.0);
         hyp.num += seen * update.y / update.s;
@@ -91,6 +96,7 @@ class PayloadFilter {
       begin(s);
       return report(s, Status::warming);
     }
+    learn_model_error(s.dt);
     look_for_change(s);
     return report(s, Status::ok);
   }
@@ -102,7 +108,7 @@ class PayloadFilter {
   const Filter& filter() const noexcept { return filter_; }
 
   /// The load as a body on the last link, for the controller's feed-forward (never of negative mass).
-  Inertia<double> load() const noexcept { return physical(load_of_state()); }
+  Inertia<double> load() const noexcept { return about_origin(mass(), centre(), Sym3<double>{}); }
 
  private:
   static constexpr std::size_t u(int i) noexcept { return static_cast<std::size_t>(i); }
@@ -143,34 +149,29 @@ class PayloadFilter {
     restart_hypotheses();
   }
   void set_load_prior() noexcept {
-    const double m = config_.mass_prior_std, c = config_.offset_prior_std * config_.mass_prior_std;
-    filter_.set_parameter(0, 0.0, m * m);
-    for (int k = 1; k < loads_; ++k) filter_.set_parameter(k, 0.0, c * c);
+    filter_.set_parameter(0, 0.0, config_.mass_prior_std * config_.mass_prior_std);
+    set_offset_prior();
   }
+  void set_offset_prior() noexcept {
+    for (int k = 1; k < loads_; ++k) filter_.set_parameter(k, 0.0, config_.offset_prior_std * config_.offset_prior_std);
+  }
+  /// After a gap: the mass may be another one.
   void forget_load() noexcept {
-    for (int k = 0; k < loads_; ++k) {
-      const double prior = k == 0 ? config_.mass_prior_std : config_.offset_prior_std * config_.mass_prior_std;
-      filter_.set_parameter(k, filter_.parameter(k), prior * prior);
-    }
+    filter_.set_parameter(0, filter_.parameter(0), config_.mass_prior_std * config_.mass_prior_std);
+    set_offset_prior();
   }
 
-  Inertia<double> load_of_state() const noexcept {
-    Inertia<double> load{};
-    for (int k = 0; k < loads_; ++k) load = load + filter_.parameter(k) * unit_[u(k)];
-    return load;
+  /// c in the last body's axes [m].
+  Vec3<double> centre() const noexcept {
+    Vec3<double> c = arm_->p_last_grasp();
+    for (int k = 1; k < loads_; ++k) c = c + filter_.parameter(k) * tip_axis_[u(k - 1)];
+    return c;
   }
-  /// Mass not below zero and the first moment within reach of the prior: what the mass matrix may be built with.
-  Inertia<double> physical(const Inertia<double>& load) const noexcept {
-    if (!(load.m > 0.0)) return Inertia<double>{};
-    Vec3<double> moment = load.mc - load.m * arm_->p_last_grasp();
-    const double limit = 4.0 * config_.offset_prior_std * load.m, length = std::sqrt(dot(moment, moment));
-    if (length > limit) moment = (limit / length) * moment;
-    const Vec3<double> c = arm_->p_last_grasp() + (1.0 / load.m) * moment;
-    return about_origin(load.m, c, Sym3<double>{});
-  }
+  /// A negative mass has weight in the filter, so that its estimate stays unbiased near zero, but no inertia.
+  double mass() const noexcept { return std::max(filter_.parameter(0), 0.0); }
 
   double bias_variance(int i, double dq) const noexcept {
-    const double std = arm_->joint(i).friction.uncertainty(dq, config_.friction_fraction);
+    const double std = filter_.expected_friction(*arm_, i).uncertainty(dq, config_.friction_fraction);
     return std * std;
   }
   void redraw_bias(int i, double variance) noexcept { filter_.set_parameter(loads_ + i, 0.0, variance); }
@@ -182,12 +183,16 @@ class PayloadFilter {
       decay_[u(loads_ + i)] = phi;
     }
     JointVector variance = torque_variance_;
+    for (int i = 0; i < arm_->n(); ++i) variance[u(i)] += model_error_[u(i)];
     add_curvature(variance);
-    const Inertia<double> load = load_of_state(), real = physical(load);
+    const Vec3<double> c = centre();
+    const Inertia<double> unit = about_origin(1.0, c, Sym3<double>{}), missing = std::min(filter_.parameter(0), 0.0) * unit;
     const int last = arm_->n() - 1;
-    filter_.predict(*arm_, {s.tau, variance, real, load + (-1.0) * real, decay_}, h, [&](const BaseFrame& chain, double* D, int stride) {
+    filter_.predict(*arm_, {s.tau, variance, load(), missing, decay_}, h, [&](const BaseFrame& chain, double* D, int stride) {
       for (int p = 0; p < loads_; ++p) {
-        const JointVector column = chain.body_torque(last, moved(chain.pose().R, chain.pose().p, unit_[u(p)]));
+        const Vec3<double>& axis = tip_axis_[u(p > 0 ? p - 1 : 0)];
+        const Inertia<double> slope = p == 0 ? unit : mass() * Inertia<double>{0.0, axis, parallel_axis(axis, c)};
+        const JointVector column = chain.body_torque(last, moved(chain.pose().R, chain.pose().p, slope));
         for (int i = 0; i <= last; ++i) D[i * stride + p] = column[u(i)];
       }
     });
@@ -197,6 +202,22 @@ class PayloadFilter {
       filter_.propagate(hyp.e);
       hyp.age += h;
     }
+  }
+
+  /// An arm whose model is wrong surprises its filter: the innovations' y^2/S, 1 on average, stays above it. A torque
+  /// variance per joint then grows until they fit, fast, and shrinks again, slowly: the interval tells of the error.
+  void learn_model_error(double dt) noexcept {
+    for (int i = 0; i < arm_->n(); ++i) {
+      const double excess = surprise_[u(i)] - 1.3;
+      const double rate = excess > 0.0 ? std::min(excess, 3.0) / 0.02 : std::max(excess, -1.0) / 1.0;
+      model_error_[u(i)] = std::clamp(model_error_[u(i)] * std::exp(std::min(rate * dt, 2.0)), least_model_error, 1e6);
+    }
+  }
+  /// Mean surprise of the joints, at least 1.
+  double surprise() const noexcept {
+    double sum = 0.0;
+    for (int i = 0; i < arm_->n(); ++i) sum += surprise_[u(i)];
+    return std::max(1.0, sum / arm_->n());
   }
 
   /// What linearisation in the mass leaves out, as extra torque variance [N^2 m^2]; both vanish as the mass becomes known.
@@ -247,7 +268,7 @@ class PayloadFilter {
     double best_score = config_.change_threshold * config_.change_threshold;
     for (const Hypothesis& hyp : hypotheses_) {
       if (!(hyp.den > 0.0)) continue;
-      const double score = hyp.num * hyp.num / hyp.den;
+      const double score = hyp.num * hyp.num / hyp.den / surprise();
       if (score > best_score && std::abs(hyp.num / hyp.den) >= config_.min_change) {
         best_score = score;
         best = &hyp;
@@ -272,8 +293,7 @@ class PayloadFilter {
         filter_.add_direction(e, 0.0, jump * jump);
       }
       filter_.add_direction(best->e, jump, prior * prior);
-      for (int k = 1; k < loads_; ++k)
-        filter_.add_parameter_variance(k, config_.offset_prior_std * config_.offset_prior_std * prior * prior);
+      if (!correction) set_offset_prior();
       restart_hypotheses();
       return;
     }
@@ -288,8 +308,9 @@ class PayloadFilter {
     out.mass = filter_.parameter(0);
     out.mass_std = mass_std();
     for (int k = 1; k < loads_; ++k) {
-      out.first_moment[u(k - 1)] = filter_.parameter(k);
-      out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0));
+      const double offset_variance = std::max(filter_.parameter_variance(k), 0.0), offset = filter_.parameter(k);
+      out.first_moment[u(k - 1)] = mass() * offset;
+      out.first_moment_std[u(k - 1)] = std::sqrt(mass() * mass() * offset_variance + offset * offset * out.mass_std * out.mass_std);
     }
     out.changes = changes_;
     out.change_time_ns = change_time_ns_;
@@ -303,8 +324,9 @@ class PayloadFilter {
   PayloadFilterConfig config_;
   int loads_, biases_;
   Filter filter_;
-  std::array<Inertia<double>, 4> unit_;
-  JointVector torque_variance_{};
+  std::array<Vec3<double>, 3> tip_axis_;  // in the last body's axes
+  static constexpr double least_model_error = 1e-6;  // [N^2 m^2]
+  JointVector torque_variance_{}, surprise_{}, model_error_{};
   Filter::Parameters decay_{};
   detail::Regime regime_{};
   std::array<Hypothesis, 12> hypotheses_;

@@ -79,6 +79,16 @@ class Pipeline {
     return gain;
   }
 
+  /// How late the observer's torque is [s].
+  double lag() const noexcept {
+    return std::visit(
+        [](const auto& observer) {
+          if constexpr (requires { observer.lag(); }) return observer.lag();
+          else return 0.0;
+        },
+        observer_);
+  }
+
   void make() {
     weighed_ = false;
     const Arm& arm = *arm_;
@@ -97,11 +107,15 @@ class Pipeline {
     struct {
       const Arm& arm;
       decltype(payload_)& to;
+      double lag;
       void operator()(std::monostate) const { to.emplace<std::monostate>(); }
       void operator()(const JointFormulaConfig& c) const { to.emplace<JointFormula>(arm, c); }
-      void operator()(const RegressionConfig& c) const { to.emplace<Regression>(arm, c); }
+      void operator()(RegressionConfig c) const {
+        if (std::isnan(c.lag)) c.lag = lag;
+        to.emplace<Regression>(arm, c);
+      }
       void operator()(const PayloadFilterConfig& c) const { to.emplace<PayloadFilter>(arm, c); }
-    } payload_maker{arm, payload_};
+    } payload_maker{arm, payload_, lag()};
     std::visit(payload_maker, config_.payload);
     const bool needs_torque = std::holds_alternative<JointFormulaConfig>(config_.payload) || std::holds_alternative<RegressionConfig>(config_.payload);
     if (needs_torque && std::holds_alternative<std::monostate>(config_.observer))

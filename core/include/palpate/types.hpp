@@ -56,6 +56,7 @@ struct JointSample {
 struct ExternalTorque {
   JointVector torque{};         ///< tau_ext [N m], > 0 when the environment pushes the joint forward
   JointVector std{};            ///< standard deviation [N m]
+  JointVector noise{};          ///< the part of std that averages out: without the error of the friction model [N m]
   Status status = Status::warming;
 };
 

@@ -55,6 +55,8 @@ class Scene:
     """what it lifts, unless told otherwise [kg]"""
     gains: tuple[Array, Array] | None
     """published kp [N m/rad] and kd [N m s/rad] of the controller, (n,) each; None: :func:`gains_at`"""
+    mass_prior: float | None = None
+    """standard deviation of the mass before anything is known, for the payload filter [kg]; None: its own"""
     assumed: tuple[str, ...] = ()
     """what the arm's description leaves open and what was taken instead, one sentence each"""
 
@@ -140,18 +142,20 @@ def scene(arm: Arm, *, mass: float | None = None) -> Scene:
         reference, poses = _UNKNOWN, {}
     heaviest = max(reference.mass, mass or 0.0)
     arm, assumed = _complete(arm, heaviest, published=reference.kp is not None)
-    start = next((name for name in poses if name.lower() == "zero"), "zero")
-    lower, upper = _limits(arm)
-    if start not in poses:
-        poses[start] = _vector(np.clip(np.zeros(arm.n), lower, upper))
-    pose = reference.pose
+    zero = next((name for name in poses if name.lower() == "zero"), "zero")
+    if zero not in poses:
+        poses[zero] = _vector(np.clip(np.zeros(arm.n), *_limits(arm)))
+    start, pose = zero, reference.pose
     if pose is None:
-        pose = "raised"
+        pose, start = "raised", "ready"
         poses[pose] = telling_pose(arm, heaviest)
-    gains = None
+        # many arms stand upright at zero: there a load has no lever, and falls whichever way
+        poses[start] = _vector(0.5 * (poses[zero] + poses[pose]))
+    gains: tuple[Array, Array] | None = None
+    prior: float | None = 4.0 * reference.mass
     if reference.kp is not None and reference.kd is not None:
-        gains = _vector(reference.kp), _vector(reference.kd)
-    return Scene(arm, MappingProxyType(poses), pose, start, reference.mass, gains, assumed)
+        gains, prior = (_vector(reference.kp), _vector(reference.kd)), None
+    return Scene(arm, MappingProxyType(poses), pose, start, reference.mass, gains, prior, assumed)
 
 
 def gains_at(arm: Arm, q: Array, period: float) -> tuple[Array, Array]:

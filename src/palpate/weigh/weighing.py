@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._core import ExtendedKalman, Status, __version__
+from .._core import ExtendedKalman, PayloadFilter, Status, __version__
 from ..arm import Arm, Array
 from ..errors import ArmError, InputError, suggest
 from ..logs import Log
@@ -287,7 +287,12 @@ def _others(weighing: Weighing) -> dict[str, Array]:
 
 
 def make_pipeline(
-    arm: Arm, estimator: str | None = None, observer: str | None = None, *, model_torque: bool = False
+    arm: Arm,
+    estimator: str | None = None,
+    observer: str | None = None,
+    *,
+    model_torque: bool = False,
+    mass_prior: float | None = None,
 ) -> tuple[Pipeline, tuple[str, ...]]:
     """The pipeline that weighs, from names.
 
@@ -297,6 +302,7 @@ def make_pipeline(
             masses.
         observer: one of palpate.pipeline.OBSERVERS, or "none"; None: what suits the estimator.
         model_torque: the samples carry the controller's own model torque.
+        mass_prior: standard deviation of the mass before anything is known, for the payload filter [kg]; None: its own.
 
     Returns:
         the pipeline, and what was decided that a person should know.
@@ -334,7 +340,10 @@ def make_pipeline(
         name = observer or "extended-kalman"
         chosen = OBSERVERS[name](**_observer_options(arm, name))
     if estimator == "payload-filter":
-        return Pipeline(arm, observer=chosen), tuple(remarks)
+        if mass_prior is None:
+            return Pipeline(arm, observer=chosen), tuple(remarks)
+        load = PayloadFilter(first_moment=True, offset_prior_std=0.02, mass_prior_std=mass_prior)
+        return Pipeline(arm, observer=chosen, payload=load), tuple(remarks)
     if chosen is None:
         raise InputError(
             f"estimator {estimator!r} weighs an external torque: choose an observer, one of {', '.join(OBSERVERS)}"

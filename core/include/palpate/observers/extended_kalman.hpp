@@ -81,7 +81,8 @@ class ExtendedKalman {
         const auto u = detail::at(i);
         out.torque[u] = filter_.parameter(i);
         const double friction = arm_->joint(i).friction.uncertainty(filter_.dq(i), config_.friction_fraction);
-        out.std[u] = std::sqrt(filter_.parameter_variance(i) + friction * friction);
+        out.noise[u] = std::sqrt(filter_.parameter_variance(i));
+        out.std[u] = std::hypot(out.noise[u], friction);
       }
     return out;
   }

@@ -18,8 +18,8 @@ class ResidualFilter {
     elapsed_ += s.dt;
     const double share = std::min(1.0, 0.5 * 1.11 * cutoff_ * s.dt);  // noise bandwidth, 1.11 w_c for order 2, against the sampling
     for (int j = 0; j < arm_->n(); ++j) {
-      const double friction = arm_->joint(j).friction.uncertainty(s.dq[at(j)], friction_fraction);
-      variance_[at(j)] = share * noise[at(j)] + friction * friction;
+      friction_[at(j)] = arm_->joint(j).friction.uncertainty(s.dq[at(j)], friction_fraction);
+      variance_[at(j)] = share * noise[at(j)];
     }
   }
   /// After a gap: what was before it is past.
@@ -29,14 +29,14 @@ class ResidualFilter {
   }
   ExternalTorque report(Status status) const noexcept {
     if (status == Status::ok && elapsed_ * cutoff_ < 4.0) status = Status::warming;
-    return detail::report(arm_->n(), low_pass_.value(), variance_, status);
+    return detail::report(arm_->n(), low_pass_.value(), variance_, friction_, status);
   }
 
  private:
   const Arm* arm_;
   double cutoff_;
   HeldButterworth<> low_pass_;
-  JointVector variance_{};
+  JointVector variance_{}, friction_{};
   double elapsed_ = 0.0;
 };
 
@@ -87,6 +87,9 @@ class InverseDynamicsObserver {
     return filter_.report(s.status);
   }
 
+  /// How late the residual is [s]: the delay of the low-pass at low frequencies.
+  double lag() const noexcept { return std::numbers::sqrt2 / config_.cutoff; }
+
   void reset() { *this = InverseDynamicsObserver(*arm_, config_); }
 
  private:
@@ -123,6 +126,9 @@ class ModelResidualObserver {
     filter_.step(s, residual, noise, config_.friction_fraction);
     return filter_.report(s.status);
   }
+
+  /// How late the residual is [s]: the delay of the low-pass at low frequencies.
+  double lag() const noexcept { return std::numbers::sqrt2 / config_.cutoff; }
 
   void reset() { *this = ModelResidualObserver(*arm_, config_); }
 

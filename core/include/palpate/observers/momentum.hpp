@@ -40,7 +40,8 @@ class MomentumObserver {
         r_[u] = a * r_[u] + b * ((t.p[u] - p_[u]) / s.dt - s.tau[u] - 0.5 * (beta[u] + beta_[u]));
         // White torque noise through the lag, white momentum noise through its derivative and the lag, and the friction.
         const double friction = arm_->joint(j).friction.uncertainty(s.dq[u], config_.friction_fraction);
-        variance_[u] = b / (1.0 + a) * arm_->torque_variance(j) + 2.0 / (1.0 + a) * (b / s.dt) * (b / s.dt) * p_variance[u] + friction * friction;
+        variance_[u] = b / (1.0 + a) * arm_->torque_variance(j) + 2.0 / (1.0 + a) * (b / s.dt) * (b / s.dt) * p_variance[u];
+        friction_[u] = friction;
       }
       elapsed_ += s.dt;
     } else {
@@ -55,15 +56,18 @@ class MomentumObserver {
     return report(s.status != Status::ok ? s.status : elapsed_ * config_.bandwidth < 3.0 ? Status::warming : Status::ok);
   }
 
+  /// How late the residual is [s].
+  double lag() const noexcept { return 1.0 / config_.bandwidth; }
+
   void reset() { *this = MomentumObserver(*arm_, config_); }
 
  private:
-  ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), r_, variance_, status); }
+  ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), r_, variance_, friction_, status); }
 
   const Arm* arm_;
   MomentumConfig config_;
   detail::MomentumNoise noise_{};
-  JointVector p_{}, beta_{}, r_{}, variance_{};
+  JointVector p_{}, beta_{}, r_{}, variance_{}, friction_{};
   double elapsed_ = 0.0;
   bool started_ = false;
 };

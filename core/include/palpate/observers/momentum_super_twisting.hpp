@@ -58,7 +58,8 @@ class MomentumSuperTwisting {
         side_[u] = sign;
         saturated = saturated || one_sided_[u] > 0.25;
         const double friction = arm_->joint(j).friction.uncertainty(s.dq[u], config_.friction_fraction);
-        variance_[u] = 2.0 * config_.max_rate * std::sqrt(p_variance[u]) + friction * friction;
+        variance_[u] = 2.0 * config_.max_rate * std::sqrt(p_variance[u]);
+        friction_[u] = friction;
       }
       elapsed_ += h;
     } else {
@@ -76,13 +77,13 @@ class MomentumSuperTwisting {
   void reset() { *this = MomentumSuperTwisting(*arm_, config_); }
 
  private:
-  ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), z_, variance_, status); }
+  ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), z_, variance_, friction_, status); }
 
   const Arm* arm_;
   SuperTwistingConfig config_;
   double alpha_ = 0.0, lambda_ = 0.0;  // [N m/s], [sqrt(N m) / sqrt(s) ...]: see the class comment
   detail::MomentumNoise noise_{};
-  JointVector p_hat_{}, beta_{}, z_{}, variance_{}, side_{}, one_sided_{};
+  JointVector p_hat_{}, beta_{}, z_{}, variance_{}, friction_{}, side_{}, one_sided_{};
   double elapsed_ = 0.0;
   bool started_ = false;
 };

@@ -21,11 +21,16 @@ inline bool unusable(const JointSample& s) noexcept {
   return s.status == Status::non_finite || s.status == Status::time_error;
 }
 
-/// An external torque with variances and status as the struct that travels on.
-inline ExternalTorque report(int n, const JointVector& torque, const JointVector& variance, Status status) noexcept {
+/// An external torque with the variance of its noise, the deviation of its friction model and its status as the struct that
+/// travels on.
+inline ExternalTorque report(int n, const JointVector& torque, const JointVector& variance, const JointVector& friction,
+                             Status status) noexcept {
   ExternalTorque out;
   out.torque = torque;
-  for (int j = 0; j < n; ++j) out.std[at(j)] = std::sqrt(variance[at(j)]);
+  for (int j = 0; j < n; ++j) {
+    out.noise[at(j)] = std::sqrt(variance[at(j)]);
+    out.std[at(j)] = std::hypot(out.noise[at(j)], friction[at(j)]);
+  }
   out.status = status;
   return out;
 }

@@ -96,7 +96,8 @@ class SlidingModeObserver {
       }
       const double friction = arm_->joint(i).friction.uncertainty(x2_[detail::at(i)], config_.friction_fraction);
       torque_[detail::at(i)] = tau;
-      variance_[detail::at(i)] = variance + arm_->torque_variance(i) + friction * friction;
+      variance_[detail::at(i)] = variance + arm_->torque_variance(i);
+      friction_[detail::at(i)] = friction;
     }
     if (s.status != Status::ok && s.status != Status::warming) return report(s.status);  // velocity is not needed: warming is fine
     return report(one_sided || since_astray_ < settle ? Status::saturated : elapsed_ < settle ? Status::warming : Status::ok);
@@ -200,13 +201,13 @@ class SlidingModeObserver {
     }
   }
 
-  ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), torque_, variance_, status); }
+  ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), torque_, variance_, friction_, status); }
 
   const Arm* arm_;
   SlidingModeConfig config_;
   HeldButterworth<> low_pass_;
   JointMatrix M_{};
-  JointVector x1_{}, x2_{}, z2_{}, side_{}, torque_{}, variance_{};
+  JointVector x1_{}, x2_{}, z2_{}, side_{}, torque_{}, variance_{}, friction_{};
   double elapsed_ = 0.0, since_astray_ = 1e9;  // [s]
   bool started_ = false;
 };
