@@ -212,7 +212,8 @@ class SensorModel:
             effort *= self._per_torque
         stamp = time_ns
         if self._jitter_ns:
-            stamp += int(rng.integers(-self._jitter_ns, self._jitter_ns, endpoint=True))
+            shift = int(rng.integers(-self._jitter_ns, self._jitter_ns, endpoint=True))
+            stamp = max(stamp + shift, 0)  # a clock that starts at 0 shows nothing below; bags cannot hold it
         arrives = self._loss == 0.0 or rng.random() >= self._loss
         if self._faults:
             stamp, arrives = self._break(time_ns, stamp, position, effort, arrives)
