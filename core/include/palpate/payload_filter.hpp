@@ -223,7 +223,8 @@ class PayloadFilter {
   /// What linearisation in the mass leaves out, as extra torque variance [N^2 m^2]; both vanish as the mass becomes known.
   /// Lever: weight torque is m times a lever that moves with q, so var(m) sum_j (d lever_i / dq_j)^2 var(z_j). Without it a
   /// filter that starts hanging, where the lever is zero, believes in masses it has read from its own noise.
-  /// Inertia: q'' is not linear in m where the load outweighs the links, so (std(m) J_i.a_c)^2 (std(m) J_i.J_i / W_ii)^2.
+  /// Inertia: q'' is not linear in m where the load may outweigh the links, so (std(m) J_i.(a_c - g))^2 times
+  /// (std(m) J_i.J_i / W_ii)^2, at most 1. Without it the first samples of a light arm are taken for a weighing.
   void add_curvature(JointVector& variance) const noexcept {
     const Pose<double> P = forward_kinematics<double>(*arm_, filter_.positions());
     const Vec3<double> c = P.p + P.R * arm_->p_last_grasp(), g = arm_->gravity();
@@ -241,7 +242,7 @@ class PayloadFilter {
       }
     }
     for (int i = 0; i < arm_->n(); ++i) {
-      const double torque = dot(J[u(i)], a_c), share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
+      const double torque = dot(J[u(i)], a_c - g), share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
       variance[u(i)] += mass_variance * torque * torque * std::min(1.0, mass_variance * share * share);
     }
   }

@@ -73,7 +73,10 @@ class Study:
         begin = time.perf_counter()
         rows, figures, notes = module.run(progress or _silent, quick)
         if quick:
-            rows = [replace(row, ok=None, note=f"quick run, not comparable; {row.note}".rstrip("; ")) for row in rows]
+            rows = [
+                replace(row, ok=None, note=f"quick run, not comparable; {row.note}".rstrip("; "))
+                for row in rows
+            ]
             notes = ["Quick run: fewer repetitions than the figures ask for; no row is judged.", *notes]
         return StudyResult(
             self.name, self.title, tuple(rows), figures, tuple(notes), time.perf_counter() - begin

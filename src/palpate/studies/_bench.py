@@ -23,7 +23,7 @@ from ..arm import Arm, Array
 from ..control import Controller, FeedforwardName, Quintic, Setpoint
 from ..drivers.mujoco import MujocoDriver
 from ..logs import Log, Sample
-from ..pipeline import Pipeline, Touch
+from ..pipeline import Payload, PayloadFilter, Pipeline, Status, Touch
 from ..simulate import Load, Schedule, SensorModel
 from . import Progress
 
@@ -59,6 +59,17 @@ POSES: Mapping[str, tuple[float, ...]] = MappingProxyType(
     }
 )
 """the six useful predefined poses, and the goal of the published run [rad]; the seventh, Zero, hangs and cannot weigh"""
+
+TWO_PERCENT = 0.02 * MASS
+"""[kg]"""
+LAST = 5.0
+"""at the end of a run, over which errors are averaged [s]"""
+COVERED_FROM = 2.0
+"""the interval is judged at every sample from then on [s]"""
+INTERVAL = 1.959963984540054
+"""half width of the 95 % interval in standard deviations"""
+MASS_ONLY, DEFAULT = "mass only", "mass and first moment (default)"
+"""the two payload filters under test"""
 
 
 def brick(mass: float = MASS, offset: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Load:
@@ -253,9 +264,24 @@ def rms(values: npt.ArrayLike) -> float:
     return math.sqrt(float(np.mean(np.square(values))))
 
 
-def grams(value: float) -> float:
-    """kg to g."""
-    return 1e3 * value
+def last(time_s: Array) -> npt.NDArray[np.bool_]:
+    """Which samples lie in the last :data:`LAST` seconds."""
+    return time_s > time_s[-1] - LAST
+
+
+def late_percent(time_s: Array, error: Array) -> float:
+    """RMS of `error` [kg] over the last seconds, in per cent of the object's mass."""
+    return 100.0 * rms(error[last(time_s)]) / MASS
+
+
+def trusted(payload: Payload, mass: float) -> float:
+    """Share of the samples that are marked ok and more than 10 % of `mass` [kg] wrong."""
+    return float(np.mean((payload.status == int(Status.ok)) & (np.abs(payload.mass - mass) > 0.1 * mass)))
+
+
+def payload_filters(arm: Arm) -> dict[str, Pipeline]:
+    """The filters under test by name."""
+    return {MASS_ONLY: Pipeline(arm, payload=PayloadFilter()), DEFAULT: Pipeline(arm)}
 
 
 # --- many runs -------------------------------------------------------------------------------------------------------
@@ -276,7 +302,7 @@ class Work:
         # spawn: the caller may have threads, which a fork would leave behind with their locks
         self._pool = (
             ProcessPoolExecutor(self._workers, mp_context=get_context("spawn"))
-            if self._workers > 1 and total > 2
+            if self._workers > 1 and total > 1
             else None
         )
 

@@ -138,9 +138,7 @@ def mass_std(
     R = np.diag(np.square(position_std))
     rounding = np.zeros(0) if count is None else np.square(count) / 12.0
     P = np.diag(
-        np.concatenate(
-            (np.full(n, 1.0), np.full(n, velocity_prior_std**2), [mass_prior_std**2], rounding)
-        )
+        np.concatenate((np.full(n, 1.0), np.full(n, velocity_prior_std**2), [mass_prior_std**2], rounding))
     )
     out = np.empty(len(transition) + 1)
     F, eye, old = np.eye(size), np.eye(size), slice(2 * n + 1, size)

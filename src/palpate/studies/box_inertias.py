@@ -15,15 +15,28 @@ from ..pipeline import (
     JointFormula,
     MomentumObserver,
     MomentumSuperTwisting,
-    PayloadFilter,
     Pipeline,
     Regression,
     SlidingModeObserver,
     Status,
 )
 from . import Progress, Row, _bench, _bound, _figures, payload_filter
-from ._bench import KD, MASS, POSES, FeedbackLaw, Law, PublishedLaw, Work, rms, settled
-from .payload_filter import DEFAULT, LAST, MASS_ONLY, Found
+from ._bench import (
+    DEFAULT,
+    KD,
+    MASS,
+    MASS_ONLY,
+    POSES,
+    FeedbackLaw,
+    Law,
+    PublishedLaw,
+    Work,
+    last,
+    late_percent,
+    rms,
+    settled,
+)
+from .payload_filter import Found
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,9 +103,7 @@ def estimators(arm: Arm) -> dict[str, Pipeline]:
     )
     return {
         SLIDING: Pipeline(_bench.as_published(arm), observer=SlidingModeObserver(), payload=JointFormula()),
-        **{
-            name: Pipeline(arm, observer=o, payload=p, conditioner=smooth) for name, (o, p) in made
-        },
+        **{name: Pipeline(arm, observer=o, payload=p, conditioner=smooth) for name, (o, p) in made},
     }
 
 
@@ -103,13 +114,13 @@ def measure(job: Job) -> Light:
     kd = tuple((SOFT if job.gains == "soft" else 1.0) * k for k in KD)
     law: Law = PublishedLaw(arm) if job.gains == "published" else FeedbackLaw(Pipeline(arm), kd=kd)
     motion = _bench.simulate(arm, law, POSES[job.pose], load=load, seed=job.seed)
-    late = motion.time > motion.time[-1] - LAST
+    late = last(motion.time)
     speed = rms(np.linalg.norm(motion.dq[late], axis=1))
     limited = float(np.mean(np.abs(motion.asked[late]) >= _bench.LIMIT * (1.0 - 1e-9)))
     if job.gains != "soft":
         return Light(Found(motion.time, math.nan, {}, None, math.nan, {}), {}, {}, 0.0, 0.0, speed, limited)
 
-    filters = {n: payload_filter.weighed(motion, p) for n, p in payload_filter.pipelines(arm).items()}
+    filters = {n: payload_filter.weighed(motion, p) for n, p in _bench.payload_filters(arm).items()}
     bounds = {}
     if job.bound:
         prior = float(filters[MASS_ONLY].std[0])
@@ -178,7 +189,7 @@ def _gain_rows(soft: Sequence[Light], hard: Sequence[Job], shaking: Sequence[Lig
 def _sliding_rows(soft: Sequence[Light]) -> list[Row]:
     least = 100.0 * min(x.saturated for x in soft)
     trusted = 100.0 * max(x.shares[SLIDING] for x in soft)
-    late = [100.0 * rms(_last(x, SLIDING)) / MASS for x in soft]
+    late = [late_percent(x.found.time, x.errors[SLIDING]) for x in soft]
     needed = [x.needed for x in soft]
     return [
         Row(
@@ -195,8 +206,8 @@ def _sliding_rows(soft: Sequence[Light]) -> list[Row]:
 def _observer_rows(soft: Sequence[Light]) -> list[Row]:
     rows = []
     for name in OBSERVERS:
-        each = np.array([100.0 * rms(_last(x, name)) / MASS for x in soft])
-        mean = np.array([100.0 * abs(float(_last(x, name).mean())) / MASS for x in soft])
+        each = np.array([late_percent(x.found.time, x.errors[name]) for x in soft])
+        mean = np.array([100.0 * abs(float(x.errors[name][last(x.found.time)].mean())) / MASS for x in soft])
         times = [settled(x.found.time, x.errors[name], 0.05 * MASS) for x in soft]
         judged = "twisting, joint" not in name  # its output is not averaged: see the note
         note = f"median {np.median(each):.2f} %; mean over the 5 s: worst {mean.max():.2f} %; within 5 % for good: median "
@@ -208,10 +219,6 @@ def _observer_rows(soft: Sequence[Light]) -> list[Row]:
             )
         )  # fmt: skip
     return rows
-
-
-def _last(x: Light, name: str) -> Array:
-    return x.errors[name][x.found.time > x.found.time[-1] - LAST]
 
 
 def _draw(soft: Sequence[Light], by_pose: Mapping[str, Sequence[Found]]) -> dict[str, Any]:

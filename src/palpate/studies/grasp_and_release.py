@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..arm import Array
-from ..pipeline import PayloadFilter, Pipeline, Status
+from ..pipeline import Status
 from ..simulate import Attach, Release, Schedule
 from . import Progress, Row, _bench, _figures
-from ._bench import MASS, POSES, FeedbackLaw, PublishedLaw, Work, settled
+from ._bench import DEFAULT, MASS, MASS_ONLY, POSES, FeedbackLaw, PublishedLaw, Work, settled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,7 +26,6 @@ QUIET_SEEDS = 4
 SETTLED = 4.0
 """after a run's start the arm rests in its pose [s]"""
 
-MASS_ONLY, DEFAULT = "mass only", "mass and first moment (default)"
 PUBLISHED, FED_BACK = "published controller", "fed back to the controller"
 
 
@@ -71,7 +70,7 @@ class Seen(NamedTuple):
 def measure(job: Job) -> list[Seen]:
     """Run one job: through both filters where the motion does not depend on them, or nearly so."""
     arm = _bench.reference_arm()
-    filters = {MASS_ONLY: Pipeline(arm, payload=PayloadFilter()), DEFAULT: Pipeline(arm)}
+    filters = _bench.payload_filters(arm)
     loop = FeedbackLaw(filters[job.fed_back]) if job.fed_back else None
     rng = np.random.default_rng([job.seed, list(POSES).index(job.pose)])
     taken, dropped = float(rng.uniform(4.0, 9.0)), float(rng.uniform(12.0, 16.0))
@@ -117,7 +116,9 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     """Measure; `quick` with one seed."""
     seeds, calm = (1, 1) if quick else (SEEDS, QUIET_SEEDS)
     jobs = [Job(p, s, DEFAULT, quiet=True, held=h) for h in (False, True) for p in POSES for s in range(calm)]
-    jobs += [Job(p, s, fed_back) for fed_back in (MASS_ONLY, DEFAULT, "") for p in POSES for s in range(seeds)]
+    jobs += [
+        Job(p, s, fed_back) for fed_back in (MASS_ONLY, DEFAULT, "") for p in POSES for s in range(seeds)
+    ]
     with Work(progress, len(jobs)) as work:
         seen = [s for found in work.map(measure, jobs) for s in found]
     rows = []
@@ -146,7 +147,9 @@ def _event_rows(group: Sequence[Seen], name: str) -> list[Row]:
     ):
         worst = float(times.max())
         never = int(np.sum(~np.isfinite(times)))
-        note = f"median {np.median(times):.3f} s, 95 % within {np.quantile(times, 0.95, method='higher'):.3f} s"
+        note = (
+            f"median {np.median(times):.3f} s, 95 % within {np.quantile(times, 0.95, method='higher'):.3f} s"
+        )
         note += f"; above the limit: {int(np.sum(times > limit))} of {len(times)}"
         note += f", never: {never}" if never else ""
         rows.append(Row(f"{name}: {what}, worst", f"<= {limit}", worst, None, worst <= limit, "s", note))

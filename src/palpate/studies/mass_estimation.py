@@ -69,9 +69,7 @@ class PublishedDrives(SensorModel):
         """Whole steps of the servo's 1023; the controller has clamped it."""
         return torque.copy() if self._exact else np.rint(torque / self._servo_step) * self._servo_step
 
-    def read(
-        self, time_ns: int, q: npt.ArrayLike, dq: npt.ArrayLike, torque: npt.ArrayLike
-    ) -> Sample | None:
+    def read(self, time_ns: int, q: npt.ArrayLike, dq: npt.ArrayLike, torque: npt.ArrayLike) -> Sample | None:
         """Whole counts, and -2 to 2 more."""
         position = np.array(q)
         if not self._exact:
@@ -122,9 +120,7 @@ class Found(NamedTuple):
     estimates: dict[float, Estimate]
 
 
-def published_mass(
-    motion: Motion, pipeline: Pipeline, joint: int, speed_gate: float
-) -> Estimate:
+def published_mass(motion: Motion, pipeline: Pipeline, joint: int, speed_gate: float) -> Estimate:
     """Mass by the joint formula wherever the published gates are open.
 
     The observer is fed the torque that was asked for. The formula's number is used from the first sample on, while the
@@ -244,10 +240,14 @@ def _curve_rows(found: Found) -> list[Row]:
 
 def _position_row(motion: Motion, published: tuple[float, ...], tolerance: float) -> Row:
     off = float(np.abs(motion.q[-1] - published).max())
-    return Row("largest distance from the published positions at 20 s", 0.0, off, tolerance, off <= tolerance, "rad")
+    return Row(
+        "largest distance from the published positions at 20 s", 0.0, off, tolerance, off <= tolerance, "rad"
+    )
 
 
-def _pose_rows(found: Mapping[Job, Found], goal: Job, poses: list[Job], still: list[Job], long: Job) -> list[Row]:
+def _pose_rows(
+    found: Mapping[Job, Found], goal: Job, poses: list[Job], still: list[Job], long: Job
+) -> list[Row]:
     rows = []
     limits = {job.pose: float(found[job].estimates[1.0].mass[-1]) for job in [long, *still]}
     for job in [*poses, goal]:
@@ -321,7 +321,15 @@ def _katana_rows(found: Found) -> list[Row]:
     note = f"± {late.std():.4f} over time; at 20 s {mass[-1]:.4f}; true {KATANA_MASS} kg"
     off = float(np.abs(motion.q[-1] - KATANA_AT_20_S).max())
     return [
-        Row("figure 16: Katana, mean mass 15 to 20 s", 0.102, ours, 0.003, abs(ours - 0.102) <= 0.003, "kg", note),
+        Row(
+            "figure 16: Katana, mean mass 15 to 20 s",
+            0.102,
+            ours,
+            0.003,
+            abs(ours - 0.102) <= 0.003,
+            "kg",
+            note,
+        ),
         Row("Katana: largest distance from the published positions at 20 s", 0.0, off, None, None, "rad"),
     ]
 
@@ -345,7 +353,11 @@ def _draw(
             "desired": motion.wanted[:, kind],
         }
         figures[f"Joint {caption} on the way to the published goal"] = joints_figure(
-            motion.time, curves, names, quantity="position" if kind == 0 else "speed", unit="rad" if kind == 0 else "rad/s"
+            motion.time,
+            curves,
+            names,
+            quantity="position" if kind == 0 else "speed",
+            unit="rad" if kind == 0 else "rad/s",
         )
     marks = {"published": (list(CURVE), list(CURVE.values()))}
     figures["Mass estimated as published (figure 11), with the published values"] = _figures.curves(

@@ -10,27 +10,34 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..arm import Arm, Array
-from ..pipeline import JointFormula, PayloadFilter, Pipeline, SlidingModeObserver
+from ..pipeline import JointFormula, Pipeline, SlidingModeObserver
 from . import Progress, Row, _bench, _bound, _figures
-from ._bench import MASS, POSES, FeedbackLaw, Motion, PublishedLaw, Work, grams, rms, settled
+from ._bench import (
+    COVERED_FROM,
+    DEFAULT,
+    INTERVAL,
+    MASS,
+    MASS_ONLY,
+    POSES,
+    TWO_PERCENT,
+    FeedbackLaw,
+    Motion,
+    PublishedLaw,
+    Work,
+    rms,
+    settled,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SEEDS = 20
-TWO_PERCENT = 0.02 * MASS
-INTERVAL = 1.959963984540054
-"""half width of the 95 % interval in standard deviations"""
-COVERED_FROM = 2.0
-"""the interval is judged at every sample from then on [s]"""
-LAST = 5.0
-"""at the end, over which errors are averaged [s]"""
 RESTED = 12.0
 """when a filter is started on the arm at rest [s]"""
 SHORT = 8.0
 """of a run that starts in the pose [s]"""
 
-MASS_ONLY, DEFAULT, ASKED = "mass only", "mass and first moment (default)", "mass only, told the unrounded torque"
+ASKED = "mass only, told the unrounded torque"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,14 +86,6 @@ def weighed(motion: Motion, pipeline: Pipeline, *, asked: bool = False) -> Weigh
     return Weighed(payload.mass - MASS, payload.mass_std, int(payload.changes[-1]))
 
 
-def pipelines(arm: Arm) -> dict[str, Pipeline]:
-    """The filters under test by name."""
-    return {
-        MASS_ONLY: Pipeline(arm, payload=PayloadFilter()),
-        DEFAULT: Pipeline(arm),
-    }
-
-
 def bounds(arm: Arm, motion: Motion, prior: float, *, substeps: int = 1) -> dict[str, Array]:
     """Cramér-Rao bounds along a run, by name; `prior` of the mass [kg]."""
     count = np.array([j.sensing.position_resolution for j in arm.joints])
@@ -104,14 +103,16 @@ def bounds(arm: Arm, motion: Motion, prior: float, *, substeps: int = 1) -> dict
 def measure(job: Job) -> Found:
     """Run one job."""
     arm = _bench.reference_arm()
-    filters = pipelines(arm)
+    filters = _bench.payload_filters(arm)
     goal = POSES[job.pose]
     if job.start != "hanging":
         law: Any = PublishedLaw(arm) if job.start == "pose" else FeedbackLaw(Pipeline(arm))
         motion = _bench.simulate(
             arm, law, goal, start=goal, load=_bench.brick(), seed=job.seed, seconds=SHORT
         )
-        return Found(motion.time, math.nan, {k: weighed(motion, p) for k, p in filters.items()}, None, math.nan, {})
+        return Found(
+            motion.time, math.nan, {k: weighed(motion, p) for k, p in filters.items()}, None, math.nan, {}
+        )
     motion = _bench.simulate(arm, PublishedLaw(arm), goal, load=_bench.brick(), seed=job.seed)
     results = {name: weighed(motion, p) for name, p in filters.items()}
     results[ASKED] = weighed(motion, filters[MASS_ONLY], asked=True)
@@ -137,7 +138,9 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     """Measure; `quick` with 2 seeds."""
     seeds = 2 if quick else SEEDS
     hanging = [Job(pose, seed, bound=seed == 0) for pose in POSES for seed in range(seeds)]
-    stretched = [Job(pose, seed, start) for start in ("pose", "held") for pose in POSES for seed in range(seeds)]
+    stretched = [
+        Job(pose, seed, start) for start in ("pose", "held") for pose in POSES for seed in range(seeds)
+    ]
     with Work(progress, len(hanging) + len(stretched)) as work:
         found = work.map(measure, [*hanging, *stretched])
     runs = found[: len(hanging)]
@@ -195,7 +198,9 @@ def time_rows(runs: Sequence[Found], name: str, *, judged: bool = False) -> list
 def _stopped_rows(runs: Sequence[Found]) -> list[Row]:
     margin = np.array([f.stopped - f.filters[MASS_ONLY].within(f.time) for f in runs])
     stopped = np.array([f.stopped for f in runs])
-    published = np.array([settled(f.time, f.published - MASS, 0.05 * MASS) for f in runs if f.published is not None])
+    published = np.array(
+        [settled(f.time, f.published - MASS, 0.05 * MASS) for f in runs if f.published is not None]
+    )
     five = np.array([settled(f.time, f.filters[MASS_ONLY].error, 0.05 * MASS) for f in runs])
     return [
         Row(
@@ -238,12 +243,12 @@ def _stretched_rows(runs: Sequence[Found], by_start: Mapping[str, Sequence[Found
 
 def accuracy_rows(runs: Sequence[Found], name: str, *, judged: bool = False) -> list[Row]:
     """Error at the end."""
-    each = np.array([rms(f.filters[name].error[f.time > f.time[-1] - LAST]) for f in runs])
+    each = np.array([rms(f.filters[name].error[_bench.last(f.time)]) for f in runs])
     worst = grams(float(each.max()))
     return [
         Row(
             f"{name}: RMS error over the last 5 s, worst run", "<= 0.3", worst, None, _judge(worst, 0.3, judged), "g",
-            f"all runs together {grams(rms(each)):.3f} g",
+            f"all runs together {1e3 * rms(each):.3f} g",
         )
     ]  # fmt: skip
 
@@ -261,12 +266,15 @@ def honesty_rows(runs: Sequence[Found], name: str, *, judged: bool = False) -> l
         )
     ]  # fmt: skip
     if judged:
-        everything = np.concatenate([f.filters[name].error for f in runs]), np.concatenate([f.filters[name].std for f in runs])
+        everything = (
+            np.concatenate([f.filters[name].error for f in runs]),
+            np.concatenate([f.filters[name].std for f in runs]),
+        )
         for top in (1e-1, 1e-2, 1e-3, 1e-4):
             chosen = (everything[1] < top) & (everything[1] >= 0.1 * top)
             if chosen.any():
                 z = rms(everything[0][chosen] / everything[1][chosen])
-                what = f"{name}: RMS of error / std while std is {grams(0.1 * top):g} to {grams(top):g} g"
+                what = f"{name}: RMS of error / std while std is {1e3 * 0.1 * top:g} to {1e3 * top:g} g"
                 rows.append(Row(what, 1.0, z, None, None, "1", f"{int(chosen.sum())} samples"))
     return rows
 
@@ -293,7 +301,9 @@ def bound_of(group: Sequence[Found]) -> dict[str, Array]:
 def pooled_bound_time(by_pose: Mapping[str, Sequence[Found]], bound: float) -> float:
     """Median over all poses of the time after which an efficient estimator stays within +-bound [kg], in [s]."""
     time = next(iter(by_pose.values()))[0].time
-    share = np.mean([_bound.still_inside(np.square(bound_of(g)["white"]), bound) for g in by_pose.values()], axis=0)
+    share = np.mean(
+        [_bound.still_inside(np.square(bound_of(g)["white"]), bound) for g in by_pose.values()], axis=0
+    )
     settled_already = np.flatnonzero(share >= 0.5)
     return float(time[settled_already[0]]) if settled_already.size else math.inf
 
@@ -309,7 +319,7 @@ def bound_rows(by_pose: Mapping[str, Sequence[Found]], name: str, *, judged: boo
             _judge(median / possible, 1.5, judged), "1", f"{median:.2f} s, bound {possible:.2f} s",
         )
     ]  # fmt: skip
-    last = runs[0].time > runs[0].time[-1] - LAST
+    last = _bench.last(runs[0].time)
     error = rms([rms(f.filters[name].error[last]) for f in runs])
     for kind, text in (("white", ""), ("rounding", ", rounding stays")):
         least = rms([rms(bound_of(g)[kind][last]) for g in by_pose.values()])
@@ -317,7 +327,7 @@ def bound_rows(by_pose: Mapping[str, Sequence[Found]], name: str, *, judged: boo
             Row(
                 f"{name}: RMS error over the last 5 s over the bound{text}", "<= 1.5" if kind == "white" else None,
                 error / least, None, _judge(error / least, 1.5, judged) if kind == "white" else None, "1",
-                f"{grams(error):.4f} g, bound {grams(least):.4f} g",
+                f"{1e3 * error:.4f} g, bound {1e3 * least:.4f} g",
             )
         )  # fmt: skip
     time = runs[0].time
@@ -371,11 +381,17 @@ def _draw(runs: Sequence[Found], by_pose: Mapping[str, Sequence[Found]]) -> dict
     kept = time >= 0.2
     curves = {}
     for name, text in ((MASS_ONLY, "mass only"), (DEFAULT, "default")):
-        curves[f"stated, {text}"] = (time[kept], grams(1.0) * _over_runs(runs, lambda f, n=name: f.filters[n].std)[kept])
-        curves[f"true RMS error, {text}"] = (time[kept], grams(1.0) * _over_runs(runs, lambda f, n=name: f.filters[n].error)[kept])
+        curves[f"stated, {text}"] = (
+            time[kept],
+            1e3 * _over_runs(runs, lambda f, n=name: f.filters[n].std)[kept],
+        )
+        curves[f"true RMS error, {text}"] = (
+            time[kept],
+            1e3 * _over_runs(runs, lambda f, n=name: f.filters[n].error)[kept],
+        )
     for kind, text in (("white", "Cramér-Rao bound"), ("rounding", "bound, rounding stays")):
         each = np.array([bound_of(group)[kind] for group in by_pose.values()])
-        curves[text] = (time[kept], grams(1.0) * np.sqrt(np.mean(np.square(each), axis=0))[kept])
+        curves[text] = (time[kept], 1e3 * np.sqrt(np.mean(np.square(each), axis=0))[kept])
     goal = by_pose["goal"][0]
     assert goal.published is not None
     mass, std = goal.filters[MASS_ONLY].error + MASS, goal.filters[MASS_ONLY].std
@@ -384,10 +400,10 @@ def _draw(runs: Sequence[Found], by_pose: Mapping[str, Sequence[Found]]) -> dict
             curves, "[g]", log=True, limits=(0.0, time[-1], 5e-3, 500.0)
         ),
         "One run to the published goal: payload filter with its 95 % band, and the published method": _figures.curves(
-            {"payload filter": (time, grams(1.0) * mass), "published method": (time, grams(1.0) * goal.published)},
+            {"payload filter": (time, 1e3 * mass), "published method": (time, 1e3 * goal.published)},
             "mass [g]",
-            level=(grams(MASS), "true"),
-            band=(time, grams(1.0) * (mass - INTERVAL * std), grams(1.0) * (mass + INTERVAL * std)),
+            level=(1e3 * MASS, "true"),
+            band=(time, 1e3 * (mass - INTERVAL * std), 1e3 * (mass + INTERVAL * std)),
             limits=(0.0, time[-1], 150.0, 420.0),
         ),
         "Time until within 2 % for good, sorted": _figures.curves(

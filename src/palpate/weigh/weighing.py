@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 TWO_PERCENT = 0.02
 TWO_SIDED_95 = 1.959963984540054
 """half width of the 95 % interval of a normal distribution [standard deviations]"""
+_HOPELESS = 2.0
+"""an arm whose pose takes so many times its torque limit does not lift but is dragged along"""
 _KALMAN_LAG = 0.3
 """time constant of the extended Kalman filter's external torque, for the regression behind it [s]"""
 _OTHER_LAG = 0.1
@@ -405,34 +407,27 @@ def weigh_session(session: Session, *, pose: str = "", scene: Scene | None = Non
 def _arrived(session: Session) -> tuple[float, tuple[bool, str] | None]:
     """Largest distance of a joint from the goal [rad]; if torque limits hold it back: whether it fails, in words."""
     task, log = session.task, session.log
-    truth = log.signals["true_position"].value
-    goal = task.poses[-1]
-    away = truth[-1] - goal
-    error = float(np.max(np.abs(away)))
+    arm, goal = task.scene.arm, task.poses[-1]
+    error = float(np.max(np.abs(log.signals["true_position"].value[-1] - goal)))
     last = log.seconds > log.seconds[-1] - 1.0
-    if log.seconds[-1] < arrival(task) or error < 0.02:
+    held_back = np.mean(session.control[last] == int(Status.saturated)) > 0.5
+    if log.seconds[-1] < arrival(task) or error < 0.02 or not held_back:
         return error, None
-    if np.mean(session.control[last] == int(Status.saturated)) < 0.5:
-        return error, None
-    arm = task.scene.arm
+    mass = max(float(session.touch.payload.mass[-1]), 0.0)
+    needed = np.abs(arm.gravity_torque(goal) - mass * (arm.gravity @ arm.jacobian(goal, arm.grasp)[:3]))
     limits = np.array([j.limits.effort for j in arm.joints])
-    full = np.mean(np.abs(session.command[last]) > 0.98 * limits, axis=0) > 0.5
-    names = ", ".join(
-        f"{j.name} ({j.limits.effort:g} N m)" for j, f in zip(arm.joints, full, strict=True) if f
-    )
-    start = task.poses[-2] if len(task.poses) > 1 else task.start
-    reach = max(0.5 * float(np.linalg.norm(goal - start)), 0.4)
-    failed = float(np.linalg.norm(away)) > reach
-    text = f"at its torque limit: {names or 'the safety limiter brakes'}."
-    if failed:
+    worst = int(np.argmax(needed / limits))
+    share = float(needed[worst] / limits[worst])
+    takes = f"it takes {needed[worst]:.3g} N m of {arm.joint_names[worst]}, which has {limits[worst]:g} N m"
+    if share > _HOPELESS:
         return error, (
             True,
-            f"The arm cannot lift this: it ends {error:.2f} rad from the pose, {text} "
-            "The mass is what its motion shows; it is not to be used.",
+            f"The arm cannot lift this to the pose: {takes}. The mass is what its motion shows; it is not to be used.",
         )
+    why = takes if share > 1.0 else "the safety limiter brakes it"
     return error, (
         False,
-        f"The arm stops {error:.2f} rad short of the pose, {text} The weighing does not depend on it.",
+        f"The arm stops {error:.2f} rad short of the pose: {why}. The weighing does not depend on it.",
     )
 
 
