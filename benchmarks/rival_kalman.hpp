@@ -66,7 +66,8 @@ class Kalman : public Rival {
     if constexpr (Torques) given += x.template segment<N>(P0 + torque);
     Vector slope;
     for (int i = 0; i < N; ++i) {
-      const palpate::Friction& friction = arm.joint(i).friction;
+      palpate::Friction friction = arm.joint(i).friction;
+      friction.sign_velocity = std::sqrt(friction.sign_velocity * friction.sign_velocity + std::max(P(N + i, N + i), 0.0));
       slope[i] = friction.derivative(v[i]);
       given[i] -= friction.torque(v[i]);
     }
@@ -163,10 +164,7 @@ class Kalman : public Rival {
   /// All positions. `seen(y, S, seen_of, K)` per update: innovation, its factor's whitening, rows of H, gain.
   template <class Seen>
   void measure(const JointSample& s, Seen&& seen) {
-    const auto noise = [&](int i) {
-      const double std = arm.joint(i).position_std;
-      return std::max(Encoders ? std * std : arm.position_variance(i), least_variance);
-    };
+    const auto noise = [&](int i) { return std::max(arm.position_variance(i), least_variance); };
     if constexpr (update == Update::one_by_one) {
       for (int i = 0; i < N; ++i) {
         State p = P.col(i);

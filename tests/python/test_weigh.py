@@ -242,7 +242,7 @@ def test_replay_notices_one_flipped_bit(log: pp.Log, tmp_path: Path) -> None:
     replace(log, position=position).save(tmp_path / "input.mcap")
     found = W.replay(pp.Log.open(tmp_path / "input.mcap", keep_invalid=True))
     assert not found.same
-    assert {d.quantity.split("[")[0] for d in found.differences} >= {"payload_mass", "estimated_position"}
+    assert "estimated_position" in {d.quantity.split("[")[0] for d in found.differences}
     assert min(d.first for d in found.differences) == 700
 
     mass = log.signals["payload_mass"]

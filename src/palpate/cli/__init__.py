@@ -29,12 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in arguments or os.environ.get("PALPATE_DEBUG", "") not in ("", "0")
     arguments = [a for a in arguments if a != "--debug"]
     try:
-        try:
-            from ._app import command
-        except ImportError as error:
-            if (error.name or "").split(".")[0] not in ("typer", "rich", "click"):
-                raise
-            raise MissingExtraError("cli", "the command palpate") from None
+        from ._app import command
+
         result = command().main(arguments, prog_name="palpate", standalone_mode=False)
         sys.stdout.flush()
         return result if isinstance(result, int) else 0
@@ -52,6 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _complain(error: Exception, debug: bool) -> int:
     """Say in one line what is wrong; the exit code."""
+    if isinstance(error, ImportError) and (error.name or "").split(".")[0] in ("typer", "rich", "click"):
+        error = MissingExtraError("cli", "the command palpate")
     usage = getattr(error, "format_message", None)  # of typer's own errors, in whichever module they live
     if isinstance(error, PalpateError) or usage is not None:
         text = " ".join(str(usage() if usage is not None else error).split())

@@ -19,11 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from .. import _core, robots
+from .._core import PayloadFilter, Status
 from ..arm import Arm, Array
 from ..control import Controller, FeedforwardName, Quintic, Setpoint
 from ..drivers.mujoco import MujocoDriver
 from ..logs import Log, Sample
-from ..pipeline import Payload, PayloadFilter, Pipeline, Status, Touch
+from ..pipeline import Payload, Pipeline, Touch
 from ..simulate import Load, Schedule, SensorModel
 from . import Progress
 
@@ -58,8 +59,10 @@ POSES: Mapping[str, tuple[float, ...]] = MappingProxyType(
         "goal": (0.5, -0.1, 1.0, 1.1, 0.0, 0.7, -0.4),
     }
 )
-"""the six useful predefined poses, and the goal of the published run [rad]; the seventh, Zero, hangs and cannot weigh"""
+"""the six useful predefined poses and the goal of the published run [rad]; the seventh, Zero, hangs"""
 
+VELOCITY_PRIOR = 1.0
+"""of the filters, one standard deviation at the start [rad/s]"""
 TWO_PERCENT = 0.02 * MASS
 """[kg]"""
 LAST = 5.0
@@ -237,9 +240,10 @@ def simulate(
         wanted[k] = target.q, target.dq
         asked = law.torque(sample, target)
         driver.write(asked)
-    times = np.arange(count) * (driver.period_ns * 1e-9)
+    times: Array = np.arange(count, dtype=np.float64) * (driver.period_ns * 1e-9)
     driver.close()
-    return Motion(arm, times, *(samples[:, i] for i in range(5)), wanted)
+    position, effort, told, q, dq = (samples[:, i] for i in range(5))
+    return Motion(arm, times, position, effort, told, q, dq, wanted)
 
 
 def reference_arm(name: str = "justina_left_arm") -> Arm:

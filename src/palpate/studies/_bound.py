@@ -110,9 +110,9 @@ def _exponential(A: Array) -> Array:
 def mass_std(
     transition: Array,
     position_std: Array,
-    *,
     mass_prior_std: float,
     velocity_prior_std: float,
+    *,
     count: Array | None = None,
     q: Array | None = None,
 ) -> Array:
@@ -126,8 +126,9 @@ def mass_std(
         position_std: (n,) noise of a position [rad].
         mass_prior_std: [kg].
         velocity_prior_std: [rad/s].
-        count: (n,) of the encoders [rad]: rounding to it as an error of its own, of standard deviation count/sqrt(12), that
-            stays while the joint stands and is another after 0.2 counts of motion. None: rounding is in position_std.
+        count: (n,) of the encoders [rad]: rounding to it as an error of its own, of standard deviation
+            count/sqrt(12), that stays while the joint stands and is another after 0.2 counts of motion. None:
+            rounding is in position_std.
         q: (N, n) true positions [rad], needed with `count`.
     """
     n = len(position_std)
@@ -157,10 +158,11 @@ def mass_std(
 
 
 def settling_time(time: Array, std: Array, bound: float) -> float:
-    """Median time after which an efficient estimator's error stays within +-bound for good [s]; infinite if it never does.
+    """Median time after which an efficient estimator's error stays within +-bound for good [s]; infinite if never.
 
-    The error of an estimator that reaches the bound at every moment is a Brownian motion in its own variance: e(t) = W(P(t)),
-    P falling. Looked at from P = 0 it leaves +-bound for the first time at P = 0.7575 bound^2 in the median.
+    The error of an estimator that reaches the bound at every moment is a Brownian motion in its own variance:
+    e(t) = W(P(t)), P falling. Looked at from P = 0 it leaves +-bound for the first time at P = 0.7575 bound^2 in
+    the median.
     """
     return crossing(time, np.square(std), FIRST_EXIT_MEDIAN * bound * bound)
 

@@ -60,8 +60,8 @@ def curves(
         ax = figure.add_subplot()
         _plot(ax, lines, log)
         if band is not None:
-            x, low, high = (values[:: max(1, len(values) // _POINTS)] for values in band)
-            ax.fill_between(x, low, high, color=colour(0), alpha=0.2, linewidth=0.0)
+            edges = [values[:: max(1, len(values) // _POINTS)] for values in band]
+            ax.fill_between(*edges, color=colour(0), alpha=0.2, linewidth=0.0)
         if level is not None:
             ax.axhline(level[0], color=LIGHT["ink"], linewidth=0.8, linestyle=(0, (4, 3)), label=level[1])
         for name, (x, y) in (marks or {}).items():

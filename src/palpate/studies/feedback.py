@@ -14,6 +14,7 @@ from ..arm import Array
 from ..pipeline import Pipeline
 from . import Progress, Row, _bench, _bound, _figures
 from ._bench import LIMIT, POSES, FeedbackLaw, PublishedLaw, Work, settled
+from ._rows import at_most, near, told
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,78 +91,80 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
         found = dict(zip(jobs, work.map(measure, jobs), strict=True))
     arm = _bench.reference_arm()
     loaded = _bound.holding(arm, _bench.brick())
-    ours = {
-        pose: [f for j, f in found.items() if j.pose == pose and not j.published and j.limit == LIMIT]
-        for pose in POSES
-    }
-    theirs = {pose: [f for j, f in found.items() if j.pose == pose and j.published] for pose in POSES}
-    strong = {pose: [f for j, f in found.items() if j.pose == pose and j.limit == STRONG] for pose in POSES}
+    mine = [(j, f) for j, f in found.items() if not j.published]
+    ours = {p: [f for j, f in mine if j.pose == p and j.limit == LIMIT] for p in POSES}
+    strong = {p: [f for j, f in mine if j.pose == p and j.limit == STRONG] for p in POSES}
+    theirs = {p: [f for j, f in found.items() if j.pose == p and j.published] for p in POSES}
     needed = {pose: loaded.gravity_torque(goal) for pose, goal in POSES.items()}
-    allowed = {pose: float(np.abs(torque).max()) <= LIMIT for pose, torque in needed.items()}
+    can = [pose for pose in POSES if float(np.abs(needed[pose]).max()) <= LIMIT]
 
-    rows = []
-    for pose, goal in POSES.items():
-        torque = needed[pose]
-        joint = int(np.abs(torque).argmax())
-        off, where = _off(ours[pose], goal)
-        before, published = _off(theirs[pose], goal)
-        note = f"needs {abs(torque[joint]):.2f} N m at joint {joint + 1} to stay there; joint {where + 1} is off the most"
-        if not allowed[pose]:
-            note += f"; beyond the limit of {LIMIT} N m"
-        note += f"; published controller: {before:.3f} rad off at joint {published + 1}"
-        rows.append(
-            Row(
-                f"pose {pose}: goal missed by, worst joint and run", f"<= {REACHED}" if allowed[pose] else None, off, None,
-                off <= REACHED if allowed[pose] else None, "rad", note,
-            )
-        )  # fmt: skip
-    for pose in POSES:
-        mine, rested = _median(ours[pose], "reached"), _median(theirs[pose], "rested")
-        reached = _median(theirs[pose], "reached")
-        note = f"at rest within 0.01 rad of where it ends: {_median(ours[pose], 'rested'):.2f} s, published {rested:.2f} s"
-        note += "" if math.isfinite(reached) else "; the published controller never reaches the goal"
-        rows.append(
-            Row(
-                f"pose {pose}: within 0.01 rad of the goal for good, median",
-                None,
-                mine,
-                None,
-                None,
-                "s",
-                note,
-            )
-        )
-    end = float(np.mean([f.end[FOURTH] for f in ours["goal"]]))
-    before = float(np.mean([f.end[FOURTH] for f in theirs["goal"]]))
-    wanted = POSES["goal"][FOURTH]
-    rows.append(
-        Row(
-            "published goal: joint 4 ends at", wanted, end, REACHED, abs(end - wanted) <= REACHED, "rad",
-            f"published 0.55; with the published controller here {before:.3f}",
-        )
-        if allowed["goal"]
-        else Row(
-            "published goal: joint 4 ends at", wanted, end, None, None, "rad",
-            f"published 0.55; with the published controller here {before:.3f}; the torque limit does not allow this goal",
-        )
-    )  # fmt: skip
-    missed = {pose: _off(strong[pose], goal)[0] for pose, goal in POSES.items()}
-    worst = max(missed, key=lambda pose: missed[pose])
-    fourth = float(np.mean([f.end[FOURTH] for f in strong["goal"]]))
-    rows.append(
-        Row(
-            f"torque limit {STRONG:g} N m instead: goal missed by, worst pose, joint and run", f"<= {REACHED}", missed[worst], None,
-            None, "rad", f"pose {worst}; published goal: joint 4 ends at {fourth:.3f}, within 0.01 rad of the goal after "
-            f"{_median(strong['goal'], 'reached'):.2f} s",
-        )
-    )  # fmt: skip
-    can = [pose for pose in POSES if allowed[pose]]
+    rows = [_goal_row(pose, pose in can, needed[pose], ours[pose], theirs[pose]) for pose in POSES]
+    rows += [_time_row(pose, ours[pose], theirs[pose]) for pose in POSES]
+    rows += _fourth_rows(ours, strong, theirs, "goal" in can)
     notes = [
-        f"{seeds} seeds per pose; gains, torque limit and noise as published. Ours: inverse dynamics of the arm with what it is "
-        "found to hold (default filter), on the filter's state.",
+        f"{seeds} seeds per pose; gains, torque limit and noise as published. Ours: inverse dynamics of the "
+        "arm with what "
+        "it is found to hold (default filter), on the filter's state.",
         f"The limit of {LIMIT} N m allows {len(can)} of {len(POSES)} poses: {', '.join(can)}.",
     ]
     return rows, _figures.drawn(lambda: _draw(found)), notes
+
+
+def _goal_row(pose: str, allowed: bool, needed: Array, ours: Sequence[Found], theirs: Sequence[Found]) -> Row:
+    goal = POSES[pose]
+    heaviest = int(np.abs(needed).argmax())
+    off, where = _off(ours, goal)
+    before, published = _off(theirs, goal)
+    note = f"needs {abs(needed[heaviest]):.2f} N m at joint {heaviest + 1} to stay there"
+    note += "" if allowed else f", beyond the limit of {LIMIT} N m"
+    note += f"; joint {where + 1} is off the most; published controller: {before:.3f} rad off at joint "
+    note += f"{published + 1}"
+    what = f"pose {pose}: goal missed by, worst joint and run"
+    return at_most(what, REACHED, off, "rad", note) if allowed else told(what, off, "rad", note)
+
+
+def _time_row(pose: str, ours: Sequence[Found], theirs: Sequence[Found]) -> Row:
+    note = f"at rest within 0.01 rad of where it ends: {_median(ours, 'rested'):.2f} s, "
+    note += f"published controller {_median(theirs, 'rested'):.2f} s"
+    if not any(math.isfinite(f.reached) for f in theirs):
+        note += ", which never reaches the goal"
+    return told(
+        f"pose {pose}: within 0.01 rad of the goal for good, median", _median(ours, "reached"), "s", note
+    )
+
+
+def _fourth_rows(
+    ours: Mapping[str, Sequence[Found]],
+    strong: Mapping[str, Sequence[Found]],
+    theirs: Mapping[str, Sequence[Found]],
+    allowed: bool,
+) -> list[Row]:
+    end, before, stronger = (
+        float(np.mean([f.end[FOURTH] for f in group["goal"]])) for group in (ours, theirs, strong)
+    )
+    missed = {pose: _off(strong[pose], goal)[0] for pose, goal in POSES.items()}
+    worst = max(missed, key=lambda pose: missed[pose])
+    note = f"published 0.55; with the published controller here {before:.3f}"
+    note += "" if allowed else "; the torque limit does not allow this goal"
+    what = f"with a torque limit of {STRONG:g} N m: goal missed by, worst pose, joint and run"
+    reached = _median(strong["goal"], "reached")
+    return [
+        near(
+            "published goal: joint 4 ends at",
+            POSES["goal"][FOURTH],
+            end,
+            REACHED,
+            "rad",
+            note,
+            judged=allowed,
+        ),
+        told(
+            what,
+            missed[worst],
+            "rad",
+            f"pose {worst}; published goal: joint 4 ends at {stronger:.3f}, goal reached after {reached:.2f} s",
+        ),
+    ]
 
 
 def _off(group: Sequence[Found], goal: Sequence[float]) -> tuple[float, int]:

@@ -1,8 +1,8 @@
 """The published mass estimation, as it was run: figures 9 to 13 and 16 and table 1 of the mass-estimation report.
 
-Negrete, Savage: Object Recognition by Physical Properties Detection using Fault Reconstruction Techniques (RCF-MathWorks
-2020). Constants of their Simulink models, errors included (MATH.md section 1, R 1 to 9); the numbers to meet are those of
-these models, re-simulated with another rigid-body library.
+Negrete, Savage: Object Recognition by Physical Properties Detection using Fault Reconstruction Techniques
+(RCF-MathWorks 2020). Constants of their Simulink models, errors included (MATH.md section 1, R 1 to 9); the numbers
+to meet are those of these models, re-simulated with another rigid-body library.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from .._core import JointFormula, SlidingModeObserver
 from ..arm import Arm, Array
 from ..control import Controller, Setpoint
 from ..logs import Sample
-from ..pipeline import JointFormula, Pipeline, SlidingModeObserver, Touch
+from ..pipeline import Pipeline, Touch
 from ..simulate import SensorModel
 from . import Progress, Row, _bench, _figures
 from ._bench import MASS, POSES, Motion, PublishedLaw, Work
@@ -63,7 +64,7 @@ class PublishedDrives(SensorModel):
         """Start the noise again."""
         super().reset()
         # numpy's Generator seeds the twister in another way
-        self._noise = np.random.RandomState(SEED)  # noqa: NPY002
+        self._noise = np.random.RandomState(SEED)
 
     def drive(self, torque: Array) -> Array:
         """Whole steps of the servo's 1023; the controller has clamped it."""
@@ -209,11 +210,16 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     rows += _lever_rows(found, long, moved)
     rows += _katana_rows(found[katana])
     notes = [
-        "Constants of the published Simulink models: lambda 6, alpha 4.2, gamma 1e-4, Q 0.003, R 0.001, Butterworth of order 4 "
-        "at 1 rad/s, l4 0.21 m, gravity 9.81 (plant 9.80665); friction in the plant only. Table 1 of the report prints "
-        "Kp 2.5, Kd 0.5 and 1 Hz: the model that made the figures had Kp 2.5 (5 at joint 1), Kd 1 (3.5, 1.5 at joints 1, 4), 1 rad/s.",
-        f"Noise: Mersenne Twister, seed {SEED}, one number per joint and sample. The plant is MuJoCo, not Simscape.",
-        "The curve is the formula's number wherever the published gates are open, also while palpate's status is still warming.",
+        "Constants of the published Simulink models: lambda 6, alpha 4.2, gamma 1e-4, Q 0.003, R 0.001, "
+        "Butterworth of order 4 "
+        "at 1 rad/s, l4 0.21 m, gravity 9.81 (plant 9.80665); friction in the plant only. Table 1 of the "
+        "report prints "
+        "Kp 2.5, Kd 0.5 and 1 Hz: the model that made the figures had Kp 2.5 (5 at joint 1), Kd 1 (3.5, 1.5 at "
+        "joints 1, 4), 1 rad/s.",
+        f"Noise: Mersenne Twister, seed {SEED}, one number per joint and sample. The plant is MuJoCo, not "
+        "Simscape.",
+        "The curve is the formula's number wherever the published gates are open, also while palpate's status "
+        "is still warming.",
         "The observer's mass settles 2.4 % below the true 0.25 kg because it takes l4 = 0.21 m for 0.205 m.",
     ]
     return rows, _figures.drawn(lambda: _draw(found, goal, long, katana, poses, moved)), notes
@@ -262,7 +268,8 @@ def _pose_rows(
                 0.006,
                 abs(ours - LIMIT_KG) <= 0.006,
                 "kg",
-                f"± {late.std():.4f} over time; without noise after {LONG:g} s {limits.get(job.pose, np.nan):.4f}; "
+                f"± {late.std():.4f} over time; without noise after {LONG:g} s "
+                f"{limits.get(job.pose, np.nan):.4f}; "
                 f"arm stops at {motion.stopped():.1f} s",
             )
         )
@@ -361,27 +368,30 @@ def _draw(
         )
     marks = {"published": (list(CURVE), list(CURVE.values()))}
     figures["Mass estimated as published (figure 11), with the published values"] = _figures.curves(
-        {"with noise": (motion.time, estimates[1.0].mass), "without": (found[long].motion.time, found[long].estimates[1.0].mass)},
+        {
+            "with noise": (motion.time, estimates[1.0].mass),
+            "without": (found[long].motion.time, found[long].estimates[1.0].mass),
+        },
         "mass [kg]", level=(MASS, "true"), marks=marks, limits=(0.0, _bench.SECONDS, -0.02, 0.42),
-    )  # fmt: skip
+    )
     figures["Model wrong by 20 % (figure 12)"] = _figures.curves(
         {f"masses x {factor:g}": (motion.time, e.mass) for factor, e in estimates.items()},
         "mass [kg]", level=(MASS, "true"), limits=(0.0, _bench.SECONDS, -0.02, 0.42),
-    )  # fmt: skip
+    )
     if moved:
         by_lever = {0.205 + job.offset: found[job] for job in sorted([*moved, long], key=lambda j: j.offset)}
         figures["Object moved along the gripper (figure 13), without noise"] = _figures.curves(
             {f"{1e3 * lever:.0f} mm": (f.motion.time, f.estimates[1.0].mass) for lever, f in by_lever.items()},
             "mass [kg]", level=(MASS, "true"), limits=(0.0, _bench.SECONDS, -0.02, 0.5),
-        )  # fmt: skip
+        )
     if poses:
         figures["All poses, with noise"] = _figures.curves(
             {job.pose: (found[job].motion.time, found[job].estimates[1.0].mass) for job in [*poses, goal]},
             "mass [kg]", level=(MASS, "true"), limits=(0.0, _bench.SECONDS, -0.1, 0.5),
-        )  # fmt: skip
+        )
     k = found[katana]
     figures["Katana (figure 16)"] = _figures.curves(
         {"estimated": (k.motion.time, k.estimates[1.0].mass)},
         "mass [kg]", level=(KATANA_MASS, "true"), limits=(0.0, _bench.SECONDS, -0.05, 0.25),
-    )  # fmt: skip
+    )
     return figures

@@ -9,21 +9,24 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from .._core import PayloadFilter
 from ..arm import Arm, Array
+from ..control import Quintic
 from ..drivers.mujoco import MujocoDriver
 from ..drivers.replay import ReplayDriver
 from ..logs import Log, Recorder, Sample
-from ..pipeline import ESTIMATORS, OBSERVERS, PayloadFilter, Pipeline, Touch
+from ..pipeline import ESTIMATORS, OBSERVERS, Pipeline, Touch
 from ..simulate import Attach, Fault, Release, Schedule, SensorModel
 from . import Progress, Row, _bench
 from ._bench import POSES, PublishedLaw, Work
+from ._rows import at_most, near
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,12 +88,13 @@ def measure(job: Job) -> Found:
         other = Log.open(table, keep_invalid=True)
     ways = {}
     again = {name: _rebuilt(arm, pipeline) for name, pipeline in live.items()}
-    for way, run in (
-        ("offline: one batch out of the MCAP recording", lambda p: _rows(p.run(log))),
-        ("offline: one batch out of an NPZ copy", lambda p: _rows(p.run(other))),
-        ("replayed through the driver, sample by sample", lambda p: _replayed(log, p)),
-        ("in pieces of " + ", ".join(map(str, CHUNKS)) + " samples", lambda p: _chunked(log, p)),
-    ):
+    runs: dict[str, Callable[[Pipeline], Array]] = {
+        "offline: one batch out of the MCAP recording": lambda p: _rows(p.run(log)),
+        "offline: one batch out of an NPZ copy": lambda p: _rows(p.run(other)),
+        "replayed through the driver, sample by sample": lambda p: _replayed(log, p),
+        "in pieces of " + ", ".join(map(str, CHUNKS)) + " samples": lambda p: _chunked(log, p),
+    }
+    for way, run in runs.items():
         numbers = different = 0
         for name, pipeline in again.items():
             pipeline.reset()
@@ -120,7 +124,7 @@ def _live(
         faults=faults if job.faulty else (),
     )
     schedule = Schedule([Attach(2.5, _bench.brick()), Release(5.5)])
-    setpoint = _bench.Quintic(np.zeros(arm.n), POSES["goal"], _bench.MOVING)
+    setpoint = Quintic(np.zeros(arm.n), POSES["goal"], _bench.MOVING)
     law = PublishedLaw(arm)
     driver = MujocoDriver(arm, sensor=sensor, schedule=schedule)
     driver.connect()
@@ -205,7 +209,8 @@ def _different(a: Array, b: Array) -> int:
 
 
 def import_seconds(times: int = IMPORTS) -> list[float]:
-    """How long `import palpate` takes in fresh interpreters that have numpy already; the first, cold one left out."""
+    """How long `import palpate` takes in fresh interpreters that have numpy already; the first, cold one left "
+    "out."""
     found = []
     for _ in range(times + 1):
         done = subprocess.run(
@@ -235,31 +240,22 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     for job, result in zip(jobs, found, strict=True):
         name = "faulty input" if job.faulty else "clean input"
         for way, (numbers, different) in result.ways.items():
-            rows.append(
-                Row(
-                    f"{name}, {way}: numbers that differ from the live run", 0, different, None, different == 0 and numbers > 0, "1",
-                    f"{numbers} numbers: {result.pipelines} pipelines, {result.samples} samples",
-                )
-            )  # fmt: skip
+            what = f"{name}, {way}: numbers that differ from the live run"
+            note = f"{numbers} numbers: {result.pipelines} pipelines, {result.samples} samples"
+            rows.append(near(what, 0, different, 0, "1", note))
     seconds = import_seconds()
-    median = statistics.median(seconds)
-    rows.append(
-        Row(
-            "import palpate, after numpy", f"<= {IMPORT_LIMIT}", median, None, median <= IMPORT_LIMIT, "s",
-            f"median of {len(seconds)} fresh interpreters, worst {max(seconds):.3f} s",
-        )
-    )  # fmt: skip
+    note = f"median of {len(seconds)} fresh interpreters, worst {max(seconds):.3f} s"
+    rows.append(at_most("import palpate, after numpy", IMPORT_LIMIT, statistics.median(seconds), "s", note))
     size, files = packed_size()
-    rows.append(
-        Row(
-            "size of the wheel", f"<= {WHEEL_LIMIT:g}", size / 1e6, None, size / 1e6 <= WHEEL_LIMIT, "MB",
-            f"the installed package's {files} files, compressed as a wheel is",
-        )
-    )  # fmt: skip
+    note = f"the installed package's {files} files, compressed as a wheel is"
+    rows.append(at_most("size of the wheel", WHEEL_LIMIT, size / 1e6, "MB", note))
     notes = [
-        "Live: every pipeline steps through the samples of a simulated run as they come, while it is recorded to MCAP. "
-        "The others are rebuilt from their options as JSON. Compared word by word: time, state, external torque, load, "
-        "standard deviations, every status. Faulty input: jitter, 2 % loss, NaN, 1e300, a stuck encoder, a clock running backwards, "
+        "Live: every pipeline steps through the samples of a simulated run as they come, while it is recorded "
+        "to MCAP. The "
+        "others are rebuilt from their options as JSON. Compared word by word: time, state, external torque, "
+        "load, standard "
+        "deviations, every status. Faulty input: jitter, 2 % loss, NaN, 1e300, a stuck encoder, a clock "
+        "running backwards, "
         "a gap of 0.4 s.",
     ]
     return rows, {}, notes

@@ -25,6 +25,7 @@ from ._bench import (
     rms,
     settled,
 )
+from ._rows import at_most, told
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -112,62 +113,73 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     jobs = _jobs(quick)
     with Work(progress, len(jobs)) as work:
         found = work.map(measure, jobs)
+    notes = [
+        f"{MASS} kg brick, its centre up to 20 mm from the grasp point in each axis of the hand, {len(found)} "
+        "runs; bench "
+        "and controller as published. The default filter knows the grasp point within 20 mm (one standard "
+        "deviation).",
+    ]
+    return [*_rows_of(found), *_place_rows(found)], _figures.drawn(lambda: _draw(found)), notes
+
+
+def _rows_of(found: Sequence[Found]) -> list[Row]:
     both = np.array([late_percent(f.time, f.error) for f in found])
     blind = np.array([late_percent(f.time, f.blind) for f in found])
     times = np.array([settled(f.time, f.error, TWO_PERCENT) for f in found])
-    late = [f.time >= COVERED_FROM - 1e-9 for f in found]
-    inside = 100.0 * float(
-        np.mean(
-            np.concatenate(
-                [np.abs(f.error[k]) <= INTERVAL * f.std[k] for f, k in zip(found, late, strict=True)]
-            )
-        )
-    )
+    late = found[0].time >= COVERED_FROM - 1e-9
+    inside = np.mean([np.abs(f.error[late]) <= INTERVAL * f.std[late] for f in found])
     off = np.array([f.moment for f in found])
-    worst = float(both.max())
-    lever = 100.0 * OFF / 0.205
-    rows = [
-        Row(
-            "mass and first moment: RMS error over the last 5 s, worst run", "<= 2", worst, None, worst <= 2.0, "%",
+    wrong = 100.0 * float(np.mean([f.wrong for f in found]))
+    blind_wrong = 100.0 * float(np.mean([f.blind_wrong for f in found]))
+    name, other = "mass and first moment", "mass only, for comparison"
+    return [
+        at_most(
+            f"{name}: RMS error over the last 5 s, worst run",
+            2.0,
+            float(both.max()),
+            "%",
             f"{len(found)} runs, median {np.median(both):.3f} %",
         ),
-        Row(
-            "mass and first moment: within 2 % for good, median", None, float(np.median(times)), None, None, "s",
-            f"worst {times.max():.2f} s",
+        told(
+            f"{name}: within 2 % for good, median", float(np.median(times)), "s", f"worst {times.max():.2f} s"
         ),
-        Row("mass and first moment: 95 % interval holds the truth", None, inside, None, None, "%", "every sample from 2 s on"),
-        Row(
-            "mass and first moment: samples marked ok and more than 10 % wrong", None,
-            100.0 * float(np.mean([f.wrong for f in found])), None, None, "%",
+        told(
+            f"{name}: 95 % interval holds the truth", 100.0 * float(inside), "%", "every sample from 2 s on"
         ),
-        Row(
-            "mass and first moment: centre of mass found, largest error at the end", None, float(1e3 * np.abs(off).max()),
-            None, None, "mm", "RMS in x, y, z: " + ", ".join(f"{1e3 * rms(c):.2f}" for c in off.T),
+        told(f"{name}: samples marked ok and more than 10 % wrong", wrong, "%"),
+        told(
+            f"{name}: centre of mass found, largest error at the end",
+            float(1e3 * np.abs(off).max()),
+            "mm",
+            "RMS in x, y, z: " + ", ".join(f"{1e3 * rms(c):.2f}" for c in off.T),
         ),
-        Row(
-            "mass and first moment: load changes seen, though there was none", None, sum(f.changes for f in found), None, None, "1",
+        told(f"{name}: load changes seen, though there was none", sum(f.changes for f in found), "1"),
+        told(
+            f"{other}: RMS error over the last 5 s, worst run",
+            float(blind.max()),
+            "%",
+            f"median {np.median(blind):.1f} %; the published formula is off by {100.0 * OFF / 0.205:.1f} % "
+            "along the hand",
         ),
-        Row(
-            "mass only, for comparison: RMS error over the last 5 s, worst run", None, float(blind.max()), None, None, "%",
-            f"median {np.median(blind):.1f} %; false load changes: {sum(f.blind_changes for f in found)}; "
-            f"{100.0 * np.mean([f.blind_wrong for f in found]):.0f} % of samples marked ok and more than 10 % wrong; the published formula is "
-            f"off by {lever:.1f} % along the hand",
+        told(
+            f"{other}: samples marked ok and more than 10 % wrong",
+            blind_wrong,
+            "%",
+            f"false load changes: {sum(f.blind_changes for f in found)}",
         ),
-    ]  # fmt: skip
-    for where in [*AXES, "random"]:
-        group = [f for f in found if f.job.where == where]
-        if group:
-            rows.append(
-                Row(
-                    f"{where}: worst RMS error over the last 5 s", None, max(late_percent(f.time, f.error) for f in group), None, None, "%",
-                    f"mass only: {max(late_percent(f.time, f.blind) for f in group):.1f} %",
-                )
-            )  # fmt: skip
-    notes = [
-        f"{_bench.MASS} kg brick, its centre up to 20 mm from the grasp point in each axis of the hand, {len(found)} runs; bench and "
-        "controller as published. The default filter knows the grasp point within 20 mm (one standard deviation).",
     ]
-    return rows, _figures.drawn(lambda: _draw(found)), notes
+
+
+def _place_rows(found: Sequence[Found]) -> list[Row]:
+    rows = []
+    for where in dict.fromkeys(f.job.where for f in found):
+        group = [f for f in found if f.job.where == where]
+        blind = max(late_percent(f.time, f.blind) for f in group)
+        worst = max(late_percent(f.time, f.error) for f in group)
+        rows.append(
+            told(f"{where}: worst RMS error over the last 5 s", worst, "%", f"mass only: {blind:.1f} %")
+        )
+    return rows
 
 
 def _draw(found: Sequence[Found]) -> dict[str, Any]:
@@ -184,6 +196,9 @@ def _draw(found: Sequence[Found]) -> dict[str, Any]:
                 "stated": (time[kept], over(lambda f: f.std)),
                 "mass only": (time[kept], over(lambda f: f.blind)),
             },
-            "[g]", log=True, level=(1e3 * TWO_PERCENT, "2 %"), limits=(0.0, time[-1], 1e-2, 1e3),
+            "[g]",
+            log=True,
+            level=(1e3 * TWO_PERCENT, "2 %"),
+            limits=(0.0, time[-1], 1e-2, 1e3),
         )
-    }  # fmt: skip
+    }

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from .._core import ExtendedKalman, PayloadFilter
 from ..arm import Arm, Array
 from ..control import Quintic, Setpoint
-from ..pipeline import ExtendedKalman, PayloadFilter, Pipeline, tare
+from ..pipeline import Pipeline, tare
 from . import Progress, Row, _bench, _figures
 from ._bench import MASS, POSES, TWO_PERCENT, FeedbackLaw, PublishedLaw, Work, late_percent, rms, settled
+from ._rows import at_most, told
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,7 +62,7 @@ TARED, TARED_ONLY, UNTARED = "after the tare", "after the tare, mass only", "wit
 def tour(arm: Arm, factors: Sequence[float], seed: int) -> Any:
     """The log of the tare's motion: 20 s, nothing held, moved by what is believed of the arm."""
     goals = [np.zeros(arm.n), *(np.array(POSES[name]) for name in WAY)]
-    legs = [Quintic(a, b, LEG) for a, b in zip(goals, goals[1:], strict=False)]
+    legs = [Quintic(a, b, LEG) for a, b in itertools.pairwise(goals)]
 
     def setpoint(t: float) -> Setpoint:
         k = min(int(t / (LEG + REST)), len(legs) - 1)
@@ -105,39 +108,30 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
         found = work.map(measure, jobs)
 
     rows = []
-    for name, judged in ((TARED, True), (TARED_ONLY, True), (UNTARED, False)):
+    for name in (TARED, TARED_ONLY, UNTARED):
         each = _percents(found, name)
         times = [settled(f.time, f.errors[p, name], TWO_PERCENT) for f in found for p in poses]
-        rows.append(
-            Row(
-                f"{name}: RMS error over the last 5 s, worst run", "<= 2" if judged else None, float(each.max()), None,
-                bool(each.max() <= 2.0) if judged else None, "%",
-                f"{each.size} runs, median {np.median(each):.3f} %; within 2 % for good: median {np.median(times):.2f} s, worst "
-                f"{max(times):.2f} s; false load changes: {sum(f.changes[name] for f in found)}; marked ok and more than 10 % wrong: "
-                f"{100.0 * np.mean([f.wrong[name] for f in found]):.1f} % of samples",
-            )
-        )  # fmt: skip
+        wrong = 100.0 * float(np.mean([f.wrong[name] for f in found]))
+        note = f"{each.size} runs, median {np.median(each):.3f} %; within 2 % for good: median "
+        note += f"{np.median(times):.2f} s, "
+        note += f"worst {max(times):.2f} s; false load changes: {sum(f.changes[name] for f in found)}; "
+        note += f"samples marked ok and more than 10 % wrong: {wrong:.1f} %"
+        what = f"{name}: RMS error over the last 5 s, worst run"
+        rows.append(at_most(what, 2.0, float(each.max()), "%", note, judged=name != UNTARED))
     off = np.array([f.factors - np.array(f.job.factors) for f in found])
     std = np.array([f.std for f in found])
-    rows.append(
-        Row(
-            "tare: a link's mass, largest error", None, float(100.0 * np.abs(off).max()), None, None, "%",
-            f"RMS {100.0 * rms(off):.2f} %; RMS of error / std {rms(off / std):.2f}",
-        )
-    )  # fmt: skip
+    note = f"RMS {100.0 * rms(off):.2f} %; RMS of error / std {rms(off / std):.2f}"
+    rows.append(told("tare: a link's mass, largest error", float(100.0 * np.abs(off).max()), "%", note))
     for f in found:
-        after = _percents([f], TARED).max()
-        only = _percents([f], TARED_ONLY).max()
-        rows.append(
-            Row(
-                f"{f.job.name}: worst RMS error over the last 5 s", None, float(after), None, None, "%",
-                f"mass only {only:.3f} %; without tare {_percents([f], UNTARED).max():.1f} %",
-            )
-        )  # fmt: skip
+        tared, only, untared = (_percents([f], name).max() for name in (TARED, TARED_ONLY, UNTARED))
+        note = f"mass only {only:.3f} %; without tare {untared:.1f} %"
+        rows.append(told(f"{f.job.name}: worst RMS error over the last 5 s", float(tared), "%", note))
     notes = [
-        "Masses and inertias of the true links differ from the model's; centres of mass are right. Tare: 20 s through five "
-        "poses with an empty hand, controlled by an extended Kalman filter on the wrong model; then the published bench and "
-        "controller, which still believes in the wrong masses.",
+        "Masses and inertias of the true links differ from the model's; centres of mass are right. Tare: 20 s "
+        "through "
+        "five poses with an empty hand, controlled by an extended Kalman filter on the wrong model; then the "
+        "published "
+        "bench and controller, which still believes in the wrong masses.",
     ]
     return rows, _figures.drawn(lambda: _draw(found)), notes
 

@@ -364,8 +364,6 @@ def run(
         with driver:
             driver.enable()
             last_ns: int | None = None
-            # a bag holds no time before 0, where jitter could put the first stamp
-            offset_ns = math.ceil(task.jitter * 1e9)
             for _ in range(count):
                 if stop is not None and stop():
                     interrupted = True
@@ -374,7 +372,6 @@ def run(
                 sample = driver.read()
                 if sample is None:
                     continue
-                sample = sample._replace(time_ns=sample.time_ns + offset_ns)
                 touch = pipeline.step(sample)
                 state = touch if control is pipeline else control.step(sample)
                 time = sample.time_ns * 1e-9
