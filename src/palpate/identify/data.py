@@ -12,8 +12,12 @@ from palpate.arm import Array
 from palpate.errors import InputError, LogError, MissingExtraError
 from palpate.logs import Log
 
-CUTOFF = 5.0
-"""default parallel filter [Hz]; see :func:`prepare`"""
+LEAST_CUTOFF = 5.0
+"""the parallel filter never goes below [Hz]: reversals of friction hold more than the motion's own band"""
+MOST_CUTOFF = 20.0
+"""nor above [Hz]: arms are not rigid there"""
+BAND_RATIO = 5.0
+"""the parallel filter passes this many times the band of the motion"""
 KINEMATIC_RATIO = 4.0
 """the kinematics are filtered this many times higher, so that they pass what the parallel filter passes"""
 GRID_RATIO = 10.0
@@ -150,7 +154,7 @@ def _reduce(values: Array, rate: float, cutoff: float) -> Array:
 def prepare(
     logs: Log | Sequence[Log],
     *,
-    cutoff: float = CUTOFF,
+    cutoff: float | None = None,
     effort: Sequence[str] | str | None = None,
     weights: Sequence[float] | None = None,
     velocity: bool | None = None,
@@ -163,12 +167,12 @@ def prepare(
     through one zero-phase low-pass at 4 times the cutoff; regressor and effort go through another at the cutoff
     (the parallel filter).
 
-    The default cutoff of 5 Hz is a choice for arms: their controllers follow motions of about 1 to 3 Hz, and
-    above it ripple of gears and motors dominates. Fits are insensitive to it within a factor of 2.
+    The default cutoff is 5 times the frequency below which 99 % of the velocity's power lies, within 5 to 20
+    Hz: what is above is ripple of gears and motors, noise and flexible modes, none of which the model knows.
 
     Args:
         logs: one or several of the same arm.
-        cutoff: parallel filter [Hz].
+        cutoff: parallel filter [Hz]; default: from the motion.
         effort: name of a signal (M, n) to take instead of the log's effort (one for all, or one per log).
         weights: per log, of its squared residuals; default 1.
         velocity: True takes the measured velocity, False differentiates the position; None takes the measured
@@ -182,6 +186,9 @@ def prepare(
     logs = (logs,) if isinstance(logs, Log) else tuple(logs)
     if not logs or not all(isinstance(log, Log) for log in logs):
         raise InputError("identification needs at least one palpate Log")
+    if cutoff is None:
+        band = max(motion_band(log) for log in logs)
+        cutoff = float(np.clip(BAND_RATIO * band, LEAST_CUTOFF, MOST_CUTOFF))
     if not (np.isfinite(cutoff) and cutoff > 0.0):
         raise InputError(f"cutoff must be a positive frequency [Hz], got {cutoff!r}")
     names = logs[0].joint_names
@@ -228,6 +235,26 @@ def prepare(
         rate=segments[0].rate / (parts[0].step or 1),
         effort_unit=logs[0].meta.get("effort_unit", ""),
     )
+
+
+def motion_band(log: Log) -> float:
+    """Frequency below which 99 % of the power of the joints' velocities lies [Hz]; 0 if nothing moves."""
+    time = log.seconds
+    forward = np.r_[True, np.diff(np.maximum.accumulate(time)) > 0.0] if len(log) else np.zeros(0, dtype=bool)
+    forward &= np.isfinite(log.position).all(axis=1)
+    if np.count_nonzero(forward) < 16:
+        return 0.0
+    raw = time[forward]
+    # positions between the samples are of no matter here, only the spectrum's bulk is
+    count = min(len(raw), 1 << 16)
+    grid = np.linspace(raw[0], raw[-1], count)
+    position = np.column_stack([np.interp(grid, raw, c) for c in log.position[forward].T])
+    velocity = np.diff(position, axis=0) * np.hanning(count - 1)[:, None]
+    power = np.square(np.abs(np.fft.rfft(velocity, axis=0))).sum(axis=1)
+    if power.sum() == 0.0:
+        return 0.0
+    frequency = np.fft.rfftfreq(count - 1, grid[1] - grid[0])
+    return float(frequency[np.searchsorted(np.cumsum(power), 0.99 * power.sum())])
 
 
 def _least(cutoff: float) -> float:

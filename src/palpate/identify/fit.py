@@ -13,7 +13,7 @@ import numpy as np
 from palpate.arm import Arm, Array, Effort, Friction
 from palpate.errors import InputError, LogError
 from palpate.identify.consistent import PRIOR, body, consistent, prior_links
-from palpate.identify.data import CUTOFF, Origin, RegressionData, prepare
+from palpate.identify.data import Origin, RegressionData, prepare
 from palpate.identify.friction import Coupling, FrictionModel, FrictionShape
 from palpate.identify.regress import (
     Base,
@@ -23,6 +23,7 @@ from palpate.identify.regress import (
     Solution,
     base_parameters,
     fastest,
+    inflation,
     least_squares,
     normal,
     parameters,
@@ -123,6 +124,9 @@ class Fit:
         phi: (p,) the parameters as numbers; covariance: (p, p).
         sigma: (n,) robust standard deviation of the residual [N m].
         inflation: (n,) regression rows per independent one [1].
+        error_std: (n,) standard deviation of the prediction's error on data the fit has not seen, in motion
+            [N m]; where nothing was held out, of the fit's own residual.
+        error_inflation: (n,) rows per independent one of that error [1].
         seconds: time the fit took, least squares alone and in all [s].
     """
 
@@ -139,6 +143,8 @@ class Fit:
     covariance: Array
     sigma: Array
     inflation: Array
+    error_std: Array
+    error_inflation: Array
     cutoff: float
     method: Method
     seconds: tuple[float, float]
@@ -206,7 +212,7 @@ def fit(
     friction: str | FrictionModel = "stribeck+load",
     couplings: Sequence[Coupling] = (),
     method: Method = "consistent",
-    cutoff: float = CUTOFF,
+    cutoff: float | None = None,
     effort: Sequence[str] | str | None = None,
     weights: Sequence[float] | None = None,
     prior: float = PRIOR,
@@ -222,7 +228,7 @@ def fit(
         couplings: drives that turn with several joints (with ``friction`` as a name).
         method: ``consistent`` (links that can exist), or least squares ``irls``, ``wls``, ``ols``: then
             ``phi`` is the solution nearest to the prior and the arm gets the nearest links that can exist.
-        cutoff: parallel low-pass [Hz], see :func:`palpate.identify.prepare`.
+        cutoff: parallel low-pass [Hz]; default: from the motion, see :func:`palpate.identify.prepare`.
         effort: name of a signal to take instead of the logs' effort [N m], e.g. a joint torque sensor's.
         weights: per log, of its squared residuals.
         prior: weight of the prior [1]; 1 lets a link's mass deviate by 50 % (one standard deviation).
@@ -253,14 +259,17 @@ def fit(
         phi = solution.phi
     predicted = problem.predict(phi)
     seen = problem.known.all(axis=1)
+    if not seen.any():  # a joint that never moves has no known friction; the others still count
+        seen = problem.known.any(axis=1)
     residuals = Residuals.of(problem.y[seen], predicted[seen], "the fit's own data")
     took = time.perf_counter() - begin
-    held = None
+    held, spread = None, _spread(problem, problem.y - predicted)
     if validate_on is not None:
         others = (validate_on,) if isinstance(validate_on, Log) else tuple(validate_on)
-        held = _residuals_on(arm, others, problem, phi, cutoff, effort, gain, "validate_on")
+        unseen = _problem_of(arm, others, problem, phi, data.cutoff, effort, gain)
+        held, spread = _held_out(unseen, unseen.predict(phi), "validate_on")
     elif cross_validate:
-        held = _cross_validate(builder, problem, method, prior)
+        held, spread = _held_out(*_cross_validate(builder, problem, method, prior))
     estimates = _table(arm, problem, phi, covariance)
     return Fit(
         arm=identified(arm, problem, links, data, gain, every),
@@ -276,7 +285,9 @@ def fit(
         covariance=covariance,
         sigma=solution.sigma,
         inflation=solution.inflation,
-        cutoff=cutoff,
+        error_std=spread[0],
+        error_inflation=spread[1],
+        cutoff=data.cutoff,
         method=method,
         seconds=(least, took),
         start=arm,
@@ -404,7 +415,9 @@ def _consistent(arm: Arm, problem: Problem, solution: Solution, prior: float):  
     return consistent(H, g, prior_links(arm), np.array(positive), start, gamma=prior)
 
 
-def _cross_validate(builder: Builder, problem: Problem, method: str, prior: float) -> Residuals | None:
+def _cross_validate(
+    builder: Builder, problem: Problem, method: str, prior: float
+) -> tuple[Problem, Array, str]:
     """Predict each log (or third of the only one) from the others; the friction's shape is kept."""
     data = problem.data
     groups = np.unique(data.log)
@@ -425,11 +438,10 @@ def _cross_validate(builder: Builder, problem: Problem, method: str, prior: floa
         if method == "consistent":
             phi = _consistent(builder.arm, train, solution, prior).phi
         predicted[fold == k] = problem.predict(phi)[fold == k]
-    seen = problem.known.all(axis=1)
-    return Residuals.of(problem.y[seen], predicted[seen], what)
+    return problem, predicted, what
 
 
-def _residuals_on(
+def _problem_of(
     arm: Arm,
     logs: Sequence[Log],
     problem: Problem,
@@ -437,12 +449,24 @@ def _residuals_on(
     cutoff: float,
     effort: Sequence[str] | str | None,
     gain: Array,
-    what: str,
-) -> Residuals:
-    data = prepare(logs, cutoff=cutoff, effort=effort if effort is None or isinstance(effort, str) else effort[0])
-    other = Builder(arm, data, data.effort * gain).problem(problem.model, problem.shape, phi)
-    seen = other.known.all(axis=1)
-    return Residuals.of(other.y[seen], other.predict(phi)[seen], what)
+) -> Problem:
+    name = effort if effort is None or isinstance(effort, str) else effort[0]
+    data = prepare(logs, cutoff=cutoff, effort=name)
+    return Builder(arm, data, data.effort * gain).problem(problem.model, problem.shape, phi)
+
+
+def _held_out(problem: Problem, predicted: Array, what: str) -> tuple[Residuals, tuple[Array, Array]]:
+    seen = problem.known.all(axis=1)
+    if not seen.any():
+        raise LogError(f"{what}: not every joint moves, so friction is unknown throughout")
+    return Residuals.of(problem.y[seen], predicted[seen], what), _spread(problem, problem.y - predicted)
+
+
+def _spread(problem: Problem, error: Array) -> tuple[Array, Array]:
+    """Standard deviation of the error in motion (n,) and rows per independent one (n,)."""
+    moving = problem.known * (problem.rest < 0.1)
+    rows = np.maximum(1.0, moving.sum(axis=0))
+    return np.sqrt(np.sum(np.square(error) * moving, axis=0) / rows), inflation(problem, error * moving)
 
 
 # -- results ----------------------------------------------------------------------------------------------------------

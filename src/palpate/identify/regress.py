@@ -34,6 +34,8 @@ HUBER = 1.345
 """residuals beyond this many standard deviations count linearly: 95 % efficient on normal noise"""
 KNOWN_AFTER = 0.03
 """path [rad] after which a joint's remembered friction no longer depends on what was before the log"""
+REST = 0.01
+"""a joint slower than this part of its fastest speed counts as at rest: friction is anywhere within +-F_c"""
 RANK = 1e-5
 """singular values of the column-scaled regressor below this part of the largest are not seen"""
 
@@ -59,6 +61,7 @@ class Problem:
         blocks: per joint the indices of its parameters (p_j,) and the regressor (M, p_j).
         y: (M, n) torque [N m], or the driver's effort.
         known: (M, n) 1 where the joint's friction state is known, else 0: such rows have no weight.
+        rest: (M, n) how much of each row is at rest, 0..1.
         data: what it was made of.
         model, shape: the friction behind the columns.
     """
@@ -67,6 +70,7 @@ class Problem:
     blocks: tuple[tuple[Array, Array], ...]
     y: Array
     known: Array
+    rest: Array
     data: RegressionData
     model: FrictionModel
     shape: FrictionShape
@@ -136,6 +140,8 @@ class Builder:
         # until a joint has moved, nobody knows what friction it stopped with before the log
         moved = data.reduce(lambda s: (np.cumsum(np.abs(s.dq), axis=0) / s.rate > KNOWN_AFTER).astype(float))
         self.known = (moved > 0.99).astype(np.float64)
+        slow = REST * fastest(data)
+        self.rest = data.reduce(lambda s: 1.0 - np.square(np.tanh(s.dq / slow))).clip(0.0, 1.0)
         self.rigid: list[Array] = []
         for j in range(n):
             # joint j bears the links from j on; the others' columns are zero
@@ -176,7 +182,7 @@ class Builder:
                     at += range(start + terms * n + 3 * c, start + terms * n + 3 * c + 3)
                     parts.append(part)
             blocks.append((np.array(at), np.column_stack(parts)))
-        return Problem(entries, tuple(blocks), self.y, self.known, self.data, model, shape)
+        return Problem(entries, tuple(blocks), self.y, self.known, self.rest, self.data, model, shape)
 
     def search_shape(self, problem: Problem, solution: Solution) -> FrictionShape:
         """x_0 and v_s per joint that leave the least (weighted) residual beside the solution's rigid torque."""
@@ -277,23 +283,26 @@ def least_squares(
         if np.all(moved <= 1e-3 * sigma):
             break
     _, sigma = _weights(problem, phi, rows, robust=method == "irls")
-    return Solution(phi, sigma, weights, inflation(problem, (problem.y - problem.predict(phi)) * problem.known))
+    return Solution(phi, sigma, weights, inflation(problem, (problem.y - problem.predict(phi)) * np.sqrt(weights)))
 
 
 def _weights(problem: Problem, phi: Array, rows: Array, *, robust: bool) -> tuple[Array, Array]:
     residual = (problem.y - problem.predict(phi)) * np.sqrt(rows)
-    seen = problem.known > 0.0
+    seen = (problem.known > 0.0) & (problem.rest < 0.1)
+    level = np.array([abs(phi[problem.index("coulomb", j)]) for j in range(problem.y.shape[1])])
     if robust:
         # the median keeps outliers out of the scale
         sizes = np.where(seen, np.abs(residual), np.nan)
         sigma = np.array([1.4826 * np.nanmedian(c) if s.any() else 0.0 for c, s in zip(sizes.T, seen.T, strict=True)])
     else:
-        sigma = np.sqrt(np.sum(np.square(residual), axis=0) / np.maximum(1, seen.sum(axis=0)))
+        sigma = np.sqrt(np.sum(np.square(residual) * seen, axis=0) / np.maximum(1, seen.sum(axis=0)))
     # the floor serves noise-free synthetic data
     sigma = np.maximum(sigma, 1e-9 * (1e-9 + np.abs(problem.y).max(axis=0)))
-    weights = rows / np.square(sigma)
+    # at rest friction is uniform within +-F_c, as the core's Friction::uncertainty has it
+    variance = np.square(sigma) + problem.rest * np.square(level) / 3.0
+    weights = rows / variance
     if robust:
-        weights = weights / np.maximum(1.0, np.abs(residual) / (HUBER * sigma))
+        weights = weights / np.maximum(1.0, np.abs(residual) / (HUBER * np.sqrt(variance)))
     return weights, sigma
 
 
