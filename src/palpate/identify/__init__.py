@@ -1,8 +1,14 @@
-"""Identification: from logs to dynamics, friction, drive gains and loads (MATH.md section 6)."""
+"""Identification: from logs to dynamics, friction, drive gains and loads (MATH.md section 6).
+
+Functions from data to frozen results; nothing is printed, plotted or written. Needs the extra ``identify``.
+"""
 
 from palpate.identify.data import RegressionData, prepare
-from palpate.identify.fit import Estimate, Fit, Prediction, Residuals, fit
+from palpate.identify.fitting import Estimate, Fit, Prediction, Residuals, fit
 from palpate.identify.friction import Coupling, FrictionModel, FrictionShape
+from palpate.identify.gains import GainFit, KnownLoad, fit_gains
+from palpate.identify.load import LoadEstimate, estimate_load
+from palpate.identify.transmission import TransmissionFit, fit_transmission
 
 __all__ = [
     "Coupling",
@@ -10,9 +16,16 @@ __all__ = [
     "Fit",
     "FrictionModel",
     "FrictionShape",
+    "GainFit",
+    "KnownLoad",
+    "LoadEstimate",
     "Prediction",
     "RegressionData",
     "Residuals",
+    "TransmissionFit",
+    "estimate_load",
     "fit",
+    "fit_gains",
+    "fit_transmission",
     "prepare",
 ]

@@ -135,8 +135,7 @@ def consistent(
     x[: 10 * n] = prior.ravel()
     guess = np.maximum(np.abs(x[positive]), 1e-6)
     x[positive] = guess
-    # the prior of a positive parameter says nothing about its size: mu/x0 with x0 the first guess, times 1e-3
-    slope = 1e-3 * barrier / guess
+    slope = barrier / guess  # where the data say nothing the first guess stays
     scale = np.concatenate([np.abs(prior).max(axis=1).repeat(10), np.ones(len(x) - 10 * n)])
     scale[positive] = guess
     ridge = 1e-12 * np.diag(H).max() * np.eye(len(x))
@@ -156,7 +155,9 @@ def consistent(
 
     now = value(x)
     hessian = H
-    for step in range(most):
+    steps = 0
+    for _ in range(most):
+        steps += 1
         inverse = np.linalg.inv(np.tensordot(x[: 10 * n].reshape(n, 10), ELEMENTS, 1))
         product = np.einsum("nab,kbc->nkac", inverse, ELEMENTS)
         gradient = H @ x - g
@@ -185,9 +186,6 @@ def consistent(
     covariance = np.linalg.inv(hessian / np.outer(d, d)) / np.outer(d, d)
     P = np.tensordot(x[: 10 * n].reshape(n, 10), ELEMENTS, 1)
     divergence = (
-        np.einsum("nab,nba->n", inverse0, P)
-        - 4.0
-        - np.linalg.slogdet(P)[1]
-        + np.linalg.slogdet(P0)[1]
+        np.einsum("nab,nba->n", inverse0, P) - 4.0 - np.linalg.slogdet(P)[1] + np.linalg.slogdet(P0)[1]
     )
-    return ConsistentSolution(x, covariance, step, divergence)
+    return ConsistentSolution(x, covariance, steps, divergence)

@@ -323,9 +323,7 @@ def _from_signal(log: Log, name: str) -> Array:
     found = log.signals[name]
     if found.value.shape[1:] != (log.n,):
         raise InputError(f"signal {name!r} must be (M, {log.n}) to serve as effort, got {found.value.shape}")
-    return np.column_stack(
-        [np.interp(log.time_ns, found.time_ns, found.value[:, j]) for j in range(log.n)]
-    )
+    return np.column_stack([np.interp(log.time_ns, found.time_ns, found.value[:, j]) for j in range(log.n)])
 
 
 class _Grid:

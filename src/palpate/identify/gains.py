@@ -20,11 +20,12 @@ import numpy as np
 from palpate.arm import Arm, Array, Effort
 from palpate.errors import InputError
 from palpate.identify.consistent import link_parameters, prior_links
-from palpate.identify.data import RegressionData, prepare
-from palpate.identify.fit import LOAD_FRICTION_STD, check_motion
+from palpate.identify.data import prepare
+from palpate.identify.fitting import LOAD_FRICTION_STD, check_joints, check_motion
 from palpate.identify.friction import FrictionModel, FrictionShape
-from palpate.identify.regress import HUBER, Builder, Problem, fastest, least_squares, structural_rank
+from palpate.identify.regress import HUBER, Builder, Problem, fastest, inflation, least_squares
 from palpate.logs import Log
+from palpate.logs.repair import BoolArray
 
 STEPS = 200
 
@@ -57,7 +58,7 @@ class KnownLoad:
                 array.setflags(write=False)
                 object.__setattr__(self, name, array)
 
-    def parameters(self) -> tuple[Array, Array]:
+    def parameters(self) -> tuple[Array, BoolArray]:
         """pi_load (10,), and which of its entries are known (10,) bool."""
         known = np.zeros(10, dtype=bool)
         known[0] = True
@@ -121,6 +122,7 @@ def fit_gains(
             "gains need logs without and logs with the known load: from free motion alone only the ratios of "
             "torques to gains are identifiable"
         )
+    check_joints(arm, (*first, *second))
     data = prepare((*first, *second), cutoff=cutoff)
     check_motion(arm, data)
     carries = data.log >= len(first)
@@ -182,7 +184,7 @@ class _State:
     iterations: int
     parameters: tuple[str, ...]
 
-    def load_torque(self, problem: Problem, carries: Array) -> Array:
+    def load_torque(self, problem: Problem, carries: BoolArray) -> Array:
         """(M, n) [N m]."""
         n = problem.y.shape[1]
         part = np.column_stack([_last_link(problem, j) @ self.load for j in range(n)])
@@ -200,7 +202,7 @@ def _problem(
     model: FrictionModel,
     shape: FrictionShape,
     state: _State | None,
-    carries: Array,
+    carries: BoolArray,
     pi: Array,
     gain: Array,
 ) -> Problem:
@@ -224,9 +226,9 @@ def _problem(
 def _solve(
     arm: Arm,
     problem: Problem,
-    carries: Array,
+    carries: BoolArray,
     pi: Array,
-    known: Array,
+    known: BoolArray,
     gain: Array,
     before: _State | None,
 ) -> _State:
@@ -295,19 +297,17 @@ def _solve(
         residual = y - predicted
         moving = (problem.known > 0.0) & (problem.rest < 0.1)
         sigma = 1.4826 * np.array(
-            [np.median(np.abs(r[m])) if m.any() else np.std(r) for r, m in zip(residual.T, moving.T, strict=True)]
+            [
+                np.median(np.abs(r[m])) if m.any() else np.std(r)
+                for r, m in zip(residual.T, moving.T, strict=True)
+            ]
         )
         sigma = np.maximum(sigma, 1e-9 * (1e-9 + np.abs(y).max(axis=0)))
         level = np.array([abs(phi[problem.index("coulomb", j)]) for j in range(n)]) * inverse
         variance = np.square(sigma) + problem.rest * np.square(level) / 3.0
         weights = rows / variance / np.maximum(1.0, np.abs(residual) / (HUBER * np.sqrt(variance)))
     gain = 1.0 / inverse
-    from palpate.identify.regress import inflation
-
     grow = inflation(problem, residual * np.sqrt(weights))
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0) * grow) * np.square(gain)
     rms = np.sqrt(np.mean(np.square(residual), axis=0)) * gain
     return _State(phi[:p].copy(), phi[p:].copy(), gain, std, rms, iterations, names)
-
-
-__all__ = ["GainFit", "KnownLoad", "RegressionData", "fit_gains", "structural_rank"]

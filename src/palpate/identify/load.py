@@ -10,7 +10,7 @@ from palpate.arm import Array
 from palpate.errors import InputError, LogError
 from palpate.identify.consistent import link_parameters
 from palpate.identify.data import prepare
-from palpate.identify.fit import Fit
+from palpate.identify.fitting import Fit, check_joints
 from palpate.identify.regress import HUBER, Builder, Problem
 from palpate.logs import Log
 
@@ -51,15 +51,13 @@ class LoadEstimate:
     rows: int
 
 
-def estimate_load(
-    fit: Fit, log: Log, *, parameters: int = 10, drift: float = FRICTION_DRIFT
-) -> LoadEstimate:
+def estimate_load(fit: Fit, log: Log, *, parameters: int = 10, drift: float = FRICTION_DRIFT) -> LoadEstimate:
     """Weigh what the arm carries in a log.
 
     The torque the free model leaves is fitted by the load's parameters, robustly, and by changes of friction of
-    ``drift`` of its size and, for the load's part, of the drives' scale. The inertia is expected near that of a body of 0.1 m radius of gyration. The error of
-    the free model enters with the size and the memory it had on data held out: that, and not the number of
-    rows, makes the interval.
+    ``drift`` of its size. The inertia is expected near that of a body of 0.1 m radius of gyration. The error of
+    the free model enters with the size and the memory it had on data held out, and the drives' scale with the
+    doubt the arm states (2 % where it states none): that, and not the number of rows, makes the interval.
 
     Args:
         fit: from free motion.
@@ -76,6 +74,7 @@ def estimate_load(
     if not (np.isfinite(drift) and drift >= 0.0):
         raise InputError(f"drift must be >= 0, got {drift!r}")
     arm = fit.arm
+    check_joints(arm, (log,))
     data = prepare(log, cutoff=fit.cutoff)
     builder = Builder(fit.start, data, data.effort * arm.effort.gain(arm.n))
     return LoadProblem(fit, builder).solve(slice(None), parameters, drift)
@@ -132,7 +131,9 @@ class LoadProblem:
         """One robust Gauss step: estimate (10,), covariance (10, 10), residual (M, n)."""
         fit = self.fit
         n = self.builder.arm.n
-        terms = [(k, p) for k, p in enumerate(problem.parameters) if p.kind in ("coulomb", "viscous", "offset")]
+        terms = [
+            (k, p) for k, p in enumerate(problem.parameters) if p.kind in ("coulomb", "viscous", "offset")
+        ]
         place = {k: 10 + i for i, (k, _) in enumerate(terms)}
         size = 10 + len(terms)
         scaled = np.zeros((size, n))

@@ -6,9 +6,11 @@ the friction model has; couplings). Rows of joint j hold its own friction and th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from palpate.arm import Arm, Array
 from palpate.errors import InputError
@@ -20,6 +22,8 @@ from palpate.identify.friction import (
     coupling_columns,
     remembered_sign,
 )
+
+IndexArray: TypeAlias = npt.NDArray[np.intp]
 
 LINK_TERMS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 _LINK_UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
@@ -36,6 +40,8 @@ KNOWN_AFTER = 0.03
 """path [rad] after which a joint's remembered friction no longer depends on what was before the log"""
 REST = 0.01
 """a joint slower than this part of its fastest speed counts as at rest: friction is anywhere within +-F_c"""
+FELT = 1e-3
+"""a parameter whose column, over the noise, is shorter than this [1/unit] has no effect: it was rounding"""
 RANK = 1e-5
 """singular values of the column-scaled regressor below this part of the largest are not seen"""
 
@@ -67,7 +73,7 @@ class Problem:
     """
 
     parameters: tuple[Parameter, ...]
-    blocks: tuple[tuple[Array, Array], ...]
+    blocks: tuple[tuple[IndexArray, Array], ...]
     y: Array
     known: Array
     rest: Array
@@ -104,12 +110,13 @@ class Solution:
     inflation: Array
 
 
-def parameters(arm: Arm, model: FrictionModel) -> tuple[Parameter, ...]:
-    """The entries of phi, in order."""
+def parameters(arm: Arm, model: FrictionModel, *, links: bool = True) -> tuple[Parameter, ...]:
+    """The entries of phi, in order; without the links if the torque at the link side is measured."""
     found = [
         Parameter(f"{j.link}.{term}", unit, "link", i)
         for i, j in enumerate(arm.joints)
         for term, unit in zip(LINK_TERMS, _LINK_UNITS, strict=True)
+        if links
     ]
     if model.rotor_inertia:
         found += [
@@ -127,15 +134,31 @@ def parameters(arm: Arm, model: FrictionModel) -> tuple[Parameter, ...]:
 
 
 class Builder:
-    """Makes problems of the same data with different friction; what does not change is computed once."""
+    """Makes problems of the same data with different friction; what does not change is computed once.
 
-    def __init__(self, arm: Arm, data: RegressionData, y: Array) -> None:
+    Args:
+        arm: kinematics.
+        data: kinematics of the logs.
+        y: (M, n) left-hand side.
+        transmitted: torque at the link side (N, n) per segment where it is measured: then y is what the drive
+            loses, and the problems have no links.
+    """
+
+    def __init__(
+        self, arm: Arm, data: RegressionData, y: Array, transmitted: tuple[Array, ...] | None = None
+    ) -> None:
         if data.n != arm.n:
             raise InputError(f"the logs have {data.n} joints, arm {arm.name!r} has {arm.n}")
         self.arm = arm
         self.data = data
         self.y = y
-        self.raw = {id(s): arm.regressor(s.q, s.dq, s.ddq) for s in data.segments}
+        self.links = transmitted is None
+        self.raw: dict[int, Array] = {}
+        if transmitted is None:
+            self.raw = {id(s): arm.regressor(s.q, s.dq, s.ddq) for s in data.segments}
+        self.transmitted = {
+            id(s): t for s, t in zip(data.segments, transmitted or (), strict=transmitted is not None)
+        }
         n = arm.n
         # until a joint has moved, nobody knows what friction it stopped with before the log
         moved = data.reduce(lambda s: (np.cumsum(np.abs(s.dq), axis=0) / s.rate > KNOWN_AFTER).astype(float))
@@ -146,21 +169,27 @@ class Builder:
         for j in range(n):
             # joint j bears the links from j on; the others' columns are zero
             def part(s: Segment, j: int = j) -> Array:
+                if not self.links:
+                    return s.ddq[:, j : j + 1]
                 return np.column_stack([self.raw[id(s)][:, j, 10 * j :], s.ddq[:, j]])
 
             self.rigid.append(data.reduce(part))
 
     def load_torque(self, segment: Segment, phi: Array) -> Array:
-        """Torque the gears transmit by the rigid parameters of phi, (N, n)."""
+        """Torque the gears transmit, measured or by the rigid parameters of phi, (N, n)."""
+        if not self.links:
+            return self.transmitted[id(segment)]
         return self.raw[id(segment)] @ phi[: 10 * self.arm.n]
 
     def problem(self, model: FrictionModel, shape: FrictionShape, phi: Array | None = None) -> Problem:
         """The problem with this friction; phi gives the load torque where the model wants it."""
         n = self.arm.n
-        entries = parameters(self.arm, model)
+        entries = parameters(self.arm, model, links=self.links)
+        width = 10 * n if self.links else 0
 
         def friction(s: Segment) -> Array:
-            torque = self.load_torque(s, phi) if model.load and phi is not None else None
+            known = phi if phi is not None or self.links else np.zeros(0)
+            torque = self.load_torque(s, known) if model.load and known is not None else None
             return columns(model, s, shape, torque)
 
         reduced = self.data.reduce(friction)
@@ -168,20 +197,20 @@ class Builder:
             self.data.reduce(lambda s, c=c: coupling_columns(c, s, shape.presliding[c.joints[0]]))  # type: ignore[misc]
             for c in model.couplings
         ]
-        start = 10 * n + (n if model.rotor_inertia else 0)
+        start = width + (n if model.rotor_inertia else 0)
         terms = len(model.terms)
         blocks = []
         for j in range(n):
-            at = [*range(10 * j, 10 * n)]
+            at = [*range(10 * j, 10 * n)] if self.links else []
             parts = [self.rigid[j] if model.rotor_inertia else self.rigid[j][:, :-1], reduced[:, j]]
             if model.rotor_inertia:
-                at.append(10 * n + j)
+                at.append(width + j)
             at += range(start + terms * j, start + terms * (j + 1))
             for c, (coupling, part) in enumerate(zip(model.couplings, couplings, strict=True)):
                 if j in coupling.joints:
                     at += range(start + terms * n + 3 * c, start + terms * n + 3 * c + 3)
                     parts.append(part)
-            blocks.append((np.array(at), np.column_stack(parts)))
+            blocks.append((np.array(at, dtype=np.intp), np.column_stack(parts)))
         return Problem(entries, tuple(blocks), self.y, self.known, self.rest, self.data, model, shape)
 
     def search_shape(self, problem: Problem, solution: Solution) -> FrictionShape:
@@ -204,11 +233,7 @@ class Builder:
         for j in range(n):
             at, A = problem.blocks[j]
             own = [k for k, i in enumerate(at) if problem.parameters[i].kind in _FRICTION_UNITS]
-            kept = [
-                k
-                for k in own
-                if problem.parameters[at[k]].kind in ("viscous", "offset", "load")
-            ]
+            kept = [k for k in own if problem.parameters[at[k]].kind in ("viscous", "offset", "load")]
             root = np.sqrt(solution.weights[:, j])
             rest = (problem.y[:, j] - A @ solution.phi[at] + A[:, own] @ solution.phi[at[own]]) * root
             fixed = A[:, kept] * root[:, None]
@@ -244,7 +269,8 @@ def normal(problem: Problem, weights: Array) -> tuple[Array, Array]:
 def minimum_change(H: Array, g: Array, phi0: Array) -> Array:
     """The least-squares solution nearest to phi0 (columns scaled to unit length) where the data say nothing."""
     scale = np.sqrt(np.diag(H))
-    scale = np.where(scale > 0.0, scale, 1.0)
+    felt = scale > FELT
+    scale = np.where(felt, scale, np.inf)
     values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
     seen = values > RANK**2 * values[-1]
     along = vectors[:, seen].T @ ((g - H @ phi0) / scale)
@@ -283,7 +309,9 @@ def least_squares(
         if np.all(moved <= 1e-3 * sigma):
             break
     _, sigma = _weights(problem, phi, rows, robust=method == "irls")
-    return Solution(phi, sigma, weights, inflation(problem, (problem.y - problem.predict(phi)) * np.sqrt(weights)))
+    return Solution(
+        phi, sigma, weights, inflation(problem, (problem.y - problem.predict(phi)) * np.sqrt(weights))
+    )
 
 
 def _weights(problem: Problem, phi: Array, rows: Array, *, robust: bool) -> tuple[Array, Array]:
@@ -293,7 +321,9 @@ def _weights(problem: Problem, phi: Array, rows: Array, *, robust: bool) -> tupl
     if robust:
         # the median keeps outliers out of the scale
         sizes = np.where(seen, np.abs(residual), np.nan)
-        sigma = np.array([1.4826 * np.nanmedian(c) if s.any() else 0.0 for c, s in zip(sizes.T, seen.T, strict=True)])
+        sigma = np.array(
+            [1.4826 * np.nanmedian(c) if s.any() else 0.0 for c, s in zip(sizes.T, seen.T, strict=True)]
+        )
     else:
         sigma = np.sqrt(np.sum(np.square(residual) * seen, axis=0) / np.maximum(1, seen.sum(axis=0)))
     # the floor serves noise-free synthetic data
@@ -349,8 +379,8 @@ def damped(problem: Problem, phi0: Array, damping: float, *, weights: Array | No
     if not (np.isfinite(damping) and damping > 0.0):
         raise InputError(f"damping must be positive, got {damping!r}")
     H, g = normal(problem, np.ones_like(problem.y) if weights is None else weights)
-    step: Array = np.linalg.solve(H + damping**2 * np.eye(p), g - H @ prior)
-    return prior + step
+    found: Array = prior + np.linalg.solve(H + damping**2 * np.eye(p), g - H @ prior)
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -386,7 +416,7 @@ def base_parameters(problem: Problem, solution: Solution, *, structural_rank: in
     for j, (at, A) in enumerate(problem.blocks):
         stacked[j * count : (j + 1) * count, at] = A * np.sqrt(solution.weights[:, j : j + 1])
     scale = np.linalg.norm(stacked, axis=0)
-    scale = np.where(scale > 0.0, scale, 1.0)
+    scale = np.where(scale > FELT, scale, np.inf)
     from scipy.linalg import qr
 
     R, pivots = qr(stacked / scale, mode="r", pivoting=True)
@@ -397,7 +427,8 @@ def base_parameters(problem: Problem, solution: Solution, *, structural_rank: in
     combination = np.zeros((rank, p))
     combination[np.arange(rank), lead] = 1.0
     tail = np.linalg.solve(R[:rank, :rank], R[:rank, rank:])
-    tail = tail * scale[rest] / scale[lead][:, None]
+    # what is not felt at all belongs to no group
+    tail = tail * np.where(np.isfinite(scale[rest]), scale[rest], 0.0) / scale[lead][:, None]
     tail[np.abs(tail) < 1e-9] = 0.0
     combination[:, rest] = tail
     order = np.argsort(lead)
@@ -416,7 +447,7 @@ def base_parameters(problem: Problem, solution: Solution, *, structural_rank: in
     )
 
 
-def _sandwich(problem: Problem, solution: Solution, lead: Array) -> Array:
+def _sandwich(problem: Problem, solution: Solution, lead: IndexArray) -> Array:
     """Covariance of the base parameters that owes nothing to independent rows.
 
     Scores are summed over blocks longer than the residual's memory; their scatter is the true spread of the
@@ -466,8 +497,3 @@ def structural_rank(arm: Arm, model: FrictionModel) -> int:
     singular = np.linalg.svd(stacked / np.where(scale > 0.0, scale, 1.0), compute_uv=False)
     friction = p - 10 * arm.n - (arm.n if model.rotor_inertia else 0)
     return int(np.count_nonzero(singular > RANK * singular[0])) + friction
-
-
-def with_effort(problem: Problem, y: Array) -> Problem:
-    """The same equations for another left-hand side (M, n)."""
-    return replace(problem, y=y)

@@ -77,9 +77,10 @@ def read_motor_pair(
     if zero.shape != (n,):
         raise InputError(f"offset must have shape ({n},), got {zero.shape}")
     motor, torques = first.position, second.position
-    good = np.isfinite(motor).all(axis=1) & np.isfinite(torques).all(axis=1)
-    good[good] &= (np.abs(motor[good]) <= POSITION_LIMIT).all(axis=1)
-    good[good] &= (np.abs(torques[good]) <= VALUE_LIMIT).all(axis=1)
+    # False for NaN, too
+    good = np.asarray(
+        (np.abs(motor) <= POSITION_LIMIT).all(axis=1) & (np.abs(torques) <= VALUE_LIMIT).all(axis=1)
+    )
     tally = Tally()
     tally.add(NON_FINITE, np.flatnonzero(~good).tolist())
     require_rows(f"{position} and {torque}", len(first), int(good.sum()), tally)

@@ -10,15 +10,14 @@ from typing import Literal
 
 import numpy as np
 
-from palpate.arm import Arm, Array, Effort, Friction
+from palpate.arm import Arm, Array, Friction
 from palpate.errors import InputError, LogError
-from palpate.identify.consistent import PRIOR, body, consistent, prior_links
+from palpate.identify.consistent import PRIOR, ConsistentSolution, body, consistent, prior_links
 from palpate.identify.data import Origin, RegressionData, prepare
 from palpate.identify.friction import Coupling, FrictionModel, FrictionShape
 from palpate.identify.regress import (
     Base,
     Builder,
-    Parameter,
     Problem,
     Solution,
     base_parameters,
@@ -26,10 +25,10 @@ from palpate.identify.regress import (
     inflation,
     least_squares,
     normal,
-    parameters,
     structural_rank,
 )
 from palpate.logs import Log
+from palpate.logs.repair import BoolArray
 
 Method = Literal["consistent", "irls", "wls", "ols"]
 LOAD_FRICTION_STD = 0.1
@@ -81,7 +80,7 @@ class Residuals:
             rms=np.sqrt(np.mean(np.square(error), axis=0)),
             relative=np.linalg.norm(error, axis=0) / np.where(size > 0.0, size, np.nan),
             overall=float(np.sqrt(np.mean(np.square(error)))),
-            relative_overall=float(np.linalg.norm(error) / max(np.linalg.norm(measured), 1e-300)),
+            relative_overall=float(np.linalg.norm(error)) / max(float(np.linalg.norm(measured)), 1e-300),
             rows=len(error),
             what=what,
         )
@@ -103,7 +102,7 @@ class Prediction:
     measured: Array
     predicted: Array
     dq: Array
-    known: Array
+    known: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,6 +244,7 @@ def fit(
     if method not in ("consistent", "irls", "wls", "ols"):
         raise InputError(f"method must be consistent, irls, wls or ols, got {method!r}")
     every = (logs,) if isinstance(logs, Log) else tuple(logs)
+    check_joints(arm, every)
     data = prepare(every, cutoff=cutoff, effort=effort, weights=weights)
     gain = np.ones(arm.n) if effort is not None else check_effort(arm, data)
     check_motion(arm, data)
@@ -297,6 +297,23 @@ def fit(
 # -- checks -----------------------------------------------------------------------------------------------------------
 
 
+def check_joints(arm: Arm, logs: Sequence[Log]) -> None:
+    """Refuse logs of other joints, or of the same in another order.
+
+    Raises:
+        InputError: the numbers of joints differ, or the names are the arm's in another order.
+    """
+    for k, log in enumerate(logs):
+        if not isinstance(log, Log):
+            continue
+        if log.n != arm.n:
+            raise InputError(f"log {k} has {log.n} joints, arm {arm.name!r} has {arm.n}; use log.select(...)")
+        if log.joint_names != arm.joint_names and set(log.joint_names) == set(arm.joint_names):
+            raise InputError(
+                f"log {k} has the arm's joints in another order; use log.select({list(arm.joint_names)})"
+            )
+
+
 def check_effort(arm: Arm, data: RegressionData) -> Array:
     """The gains (n,), after a look whether they can be meant.
 
@@ -334,7 +351,9 @@ def check_motion(arm: Arm, data: RegressionData) -> None:
         )
     revolute = np.array([j.kind == "revolute" for j in arm.joints])
     limits = np.array([max(abs(j.limits.lower), abs(j.limits.upper)) for j in arm.joints])
-    beyond = revolute & (np.abs(data.q).max(axis=0) > 3.0 * np.where(np.isfinite(limits), limits, 4 * math.pi))
+    beyond = revolute & (
+        np.abs(data.q).max(axis=0) > 3.0 * np.where(np.isfinite(limits), limits, 4 * math.pi)
+    )
     if beyond.any():
         worst = int(np.argmax(np.where(beyond, np.abs(data.q).max(axis=0), 0.0)))
         raise InputError(
@@ -360,16 +379,16 @@ def _unseen(arm: Arm, problem: Problem, base: Base) -> tuple[str, ...]:
             )
     missing = base.structural_rank - base.rank
     if missing > 0:
-        found.append(f"{missing} of {base.structural_rank} base parameters: more varied motion would show them")
+        found.append(
+            f"{missing} of {base.structural_rank} base parameters: more varied motion would show them"
+        )
     return tuple(found)
 
 
 # -- solving ----------------------------------------------------------------------------------------------------------
 
 
-def solve_shape(
-    builder: Builder, model: FrictionModel, *, method: str = "irls"
-) -> tuple[Problem, Solution]:
+def solve_shape(builder: Builder, model: FrictionModel, *, method: str = "irls") -> tuple[Problem, Solution]:
     """Friction shape, load torque and least squares in turn."""
     n = builder.arm.n
     middle = model.presliding[len(model.presliding) // 2]
@@ -403,14 +422,10 @@ def information(problem: Problem, solution: Solution) -> tuple[Array, Array]:
     return H, g
 
 
-def _consistent(arm: Arm, problem: Problem, solution: Solution, prior: float):  # type: ignore[no-untyped-def]
+def _consistent(arm: Arm, problem: Problem, solution: Solution, prior: float) -> ConsistentSolution:
     H, g = information(problem, solution)
     kinds = [p.kind for p in problem.parameters]
-    positive = [
-        k
-        for k, p in enumerate(problem.parameters)
-        if p.kind in POSITIVE or p.kind == "coupling"
-    ]
+    positive = [k for k, p in enumerate(problem.parameters) if p.kind in POSITIVE or p.kind == "coupling"]
     start = np.where(np.isin(kinds, ["load"]), 0.02, np.maximum(np.abs(solution.phi), 1e-3))
     return consistent(H, g, prior_links(arm), np.array(positive), start, gamma=prior)
 
@@ -509,7 +524,9 @@ def identified(
                 mass=mass,
                 com=com,
                 inertia=0.5 * (inertia + inertia.T),
-                rotor_inertia=max(0.0, value("rotor")) if problem.model.rotor_inertia else joint.rotor_inertia,
+                rotor_inertia=max(0.0, value("rotor"))
+                if problem.model.rotor_inertia
+                else joint.rotor_inertia,
                 friction=Friction(
                     coulomb=coulomb,
                     viscous=max(0.0, value("viscous")),
@@ -542,11 +559,3 @@ def _resolution(position: Array) -> float:
     step = float(np.min(np.diff(values)))
     # a count repeats: readings on a grid have far fewer values than samples
     return step if len(values) < 0.5 * len(position) or step > 1e-7 else 0.0
-
-
-def effort_of(gain: Array) -> Effort:
-    """Gains (n,) [N m/A] as an effort."""
-    return Effort.current([float(k) for k in gain])
-
-
-__all__ = ["Estimate", "Fit", "Parameter", "Prediction", "Residuals", "fit", "parameters"]
