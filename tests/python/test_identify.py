@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from palpate import Arm, Effort, Friction, robots
+from palpate import Arm, Effort, Friction, Joint, robots
 from palpate.errors import InputError, LogError
 from palpate.identify import (
     Coupling,
@@ -15,6 +15,7 @@ from palpate.identify import (
     KnownLoad,
     estimate_load,
     fit,
+    fit_bus_drive,
     fit_gains,
     fit_transmission,
     prepare,
@@ -471,3 +472,54 @@ def test_what_was_not_seen_is_said():
     assert f"{arm.joint_names[3]} never reverses" in text
     assert "base parameters" in text
     assert all(np.isfinite(e.value) for e in found.parameters)
+
+
+# -- servos -----------------------------------------------------------------------------------------------------------
+
+
+def servo_log(seconds: float, seed: int, *, heat: float = 30.0) -> tuple[Arm, Log]:
+    joint = Joint(
+        name="joint_1",
+        link="pendulum",
+        kind="revolute",
+        T_parent_joint=np.eye(4),
+        axis=np.array([0.0, 1.0, 0.0]),
+        mass=0.5,
+        com=np.array([0.0, 0.0, -0.1]),
+        inertia=1e-6 * np.eye(3),
+    )
+    arm = Arm(name="pendulum", joints=(joint,))
+    t, q, dq, ddq = motion(1, seconds, seed)
+    drive = arm.inverse_dynamics(q, dq, ddq)[:, 0] + 0.002 * ddq[:, 0] + 0.04 * np.tanh(dq[:, 0] / 1e-3)
+    drive += 0.01 * dq[:, 0]
+    power = heat * drive**2 + dq[:, 0] * drive
+    bus = np.sign(drive) * np.maximum(power, 0.0) / 7.4
+    time_ns = np.rint(t * 1e9).astype(np.int64)
+    return arm, Log(
+        time_ns=time_ns,
+        position=q,
+        effort=bus[:, None],
+        joint_names=("joint_1",),
+        signals={"voltage": Signal(time_ns, np.full(len(t), 7.4), "V")},
+        meta={"effort_unit": "A"},
+    )
+
+
+def test_servo_with_the_current_of_its_supply():
+    arm, log = servo_log(20.0, 0)
+    drive = fit_bus_drive(arm, [log, servo_log(20.0, 1)[1]])
+    assert drive.heat == pytest.approx(30.0, rel=0.05)
+    assert drive.coulomb == pytest.approx(0.04, rel=0.15)
+    torque, data = drive.load_torque(servo_log(20.0, 2)[1])
+    heavy = data.reduce(lambda s: arm.inverse_dynamics(s.q, s.dq, s.ddq))[:, 0]
+    assert heavy @ torque / (heavy @ heavy) == pytest.approx(1.0, abs=0.03)
+    bus = np.array([0.3, -0.3, 0.0])
+    tau = drive.motor_torque(bus, np.full(3, 7.4), np.array([1.0, 1.0, 1.0]))
+    np.testing.assert_allclose(drive.heat * tau**2 + tau, np.abs(bus) * 7.4, atol=1e-12)
+    with pytest.raises(InputError, match="voltage"):
+        fit_bus_drive(arm, dataclasses.replace(log, signals={}))
+    with pytest.raises(InputError, match="one joint"):
+        fit_bus_drive(truth(), log)
+    off = Signal(log.time_ns, np.zeros(len(log)), "1")
+    with pytest.raises(LogError, match="off"):
+        fit_bus_drive(arm, dataclasses.replace(log, signals={**log.signals, "enabled": off}))

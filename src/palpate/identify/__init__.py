@@ -8,9 +8,11 @@ from palpate.identify.fitting import Estimate, Fit, Prediction, Residuals, fit
 from palpate.identify.friction import Coupling, FrictionModel, FrictionShape
 from palpate.identify.gains import GainFit, KnownLoad, fit_gains
 from palpate.identify.load import LoadEstimate, estimate_load
+from palpate.identify.servo import BusDrive, fit_bus_drive
 from palpate.identify.transmission import TransmissionFit, fit_transmission
 
 __all__ = [
+    "BusDrive",
     "Coupling",
     "Estimate",
     "Fit",
@@ -25,6 +27,7 @@ __all__ = [
     "TransmissionFit",
     "estimate_load",
     "fit",
+    "fit_bus_drive",
     "fit_gains",
     "fit_transmission",
     "prepare",
