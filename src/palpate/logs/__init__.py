@@ -1,6 +1,7 @@
 """Logs of robot arms: open, check, slice, record, save."""
 
 from palpate.logs.columns import ColumnMap, SignalColumns
+from palpate.logs.formats import read_bam, read_motor_pair, read_tx40
 from palpate.logs.log import Event, Log, Sample, Signal
 from palpate.logs.recorder import Recorder
 from palpate.logs.repair import Clock, RepairReport
@@ -15,4 +16,7 @@ __all__ = [
     "Sample",
     "Signal",
     "SignalColumns",
+    "read_bam",
+    "read_motor_pair",
+    "read_tx40",
 ]

@@ -354,12 +354,23 @@ def conventional(header: Sequence[str] | None, where: str) -> ColumnMap:
 
 
 def _fits(columns: ColumnMap, header: Sequence[str]) -> bool:
+    if columns.header is False:  # indices fit any table that is wide enough
+        return False
     try:
         resolve(columns, header, len(header), "")
     except LogError:
         return False
     return True
 
+
+_UR_JOINTS = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
 
 _NAMED = {
     # NEURA LARA 8 with a wrist force/torque sensor (A. Lucious, MasterThesis, BSD-3-Clause). The effort is
@@ -380,5 +391,61 @@ _NAMED = {
             "target_joint_velocity": SignalColumns("target_joint_velocity_{joint}", "rad/s"),
             "pose": SignalColumns([f"pose_{c}" for c in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")], "m, 1"),
         },
+    ),
+    # Universal Robots UR10e, identification and validation runs (Innopolis University, dynamic_calibration): 31
+    # columns, no header. model_torque is the manufacturer's rigid-body model without load and friction.
+    "ur10e": ColumnMap(
+        time=0,
+        time_unit="s",
+        position=range(1, 7),
+        velocity=range(7, 13),
+        effort=range(13, 19),
+        effort_unit="A",
+        model_torque=range(25, 31),
+        model_torque_unit="N m",
+        signals={"target_current": SignalColumns(range(19, 25), "A")},
+        joint_names=_UR_JOINTS,
+        header=False,
+    ),
+    # The same robot's collision runs: 25 columns, no header. The wrench is the controller's own estimate at the
+    # tool, in the UR base frame (URDF base_link turned by 180 deg about z).
+    "ur10e_wrench": ColumnMap(
+        time=0,
+        time_unit="s",
+        position=range(1, 7),
+        velocity=range(7, 13),
+        effort=range(13, 19),
+        effort_unit="A",
+        signals={"wrench": SignalColumns(range(19, 25), "N, N m")},
+        joint_names=_UR_JOINTS,
+        header=False,
+    ),
+    # Kinova Gen3 (DynaMapp, CC0-1.0). The effort is the motor current; torque_sensor is what the joint torque
+    # sensors read, torque_current the controller's torque from the current.
+    "kinova_gen3": ColumnMap(
+        time="Time",
+        time_unit="ms",
+        position="Position{joint}",
+        velocity="Velocity{joint}",
+        effort="Cur{joint}",
+        effort_unit="A",
+        model_torque="Torque{joint}",
+        model_torque_unit="N m",
+        joints=(1, 2, 3, 4, 5, 6, 7),
+        signals={
+            "torque_sensor": SignalColumns("TorqueSm{joint}", "N m"),
+            "torque_current": SignalColumns("TorqueCur{joint}", "N m"),
+            "temperature": SignalColumns("Temp{joint}", "degC"),
+            "position_command": SignalColumns("PositionCmptd{joint}", "rad"),
+        },
+    ),
+    # KUKA LWR 4+ (FloBaRoID, LGPL-3.0), .npz. The effort is what the joint torque sensors read.
+    "kuka_lwr4": ColumnMap(
+        time="times",
+        time_unit="s",
+        position="positions",
+        velocity="velocities",
+        effort="torques",
+        effort_unit="N m",
     ),
 }

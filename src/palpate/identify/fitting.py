@@ -1,0 +1,561 @@
+"""From logs to an identified arm: a frozen result, no prints, plots or files."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from palpate.arm import Arm, Array, Friction
+from palpate.errors import InputError, LogError
+from palpate.identify.consistent import PRIOR, ConsistentSolution, body, consistent, prior_links
+from palpate.identify.data import Origin, RegressionData, prepare
+from palpate.identify.friction import Coupling, FrictionModel, FrictionShape
+from palpate.identify.regress import (
+    Base,
+    Builder,
+    Problem,
+    Solution,
+    base_parameters,
+    fastest,
+    inflation,
+    least_squares,
+    normal,
+    structural_rank,
+)
+from palpate.logs import Log
+from palpate.logs.repair import BoolArray
+
+Method = Literal["consistent", "irls", "wls", "ols"]
+LOAD_FRICTION_STD = 0.1
+"""prior of the load-dependent friction coefficient [1]: gears that lose more of what they carry are rare"""
+ROUNDS = 3
+"""rounds of friction shape, load torque and least squares; the third changes nothing that shows"""
+POSITIVE = ("rotor", "coulomb", "viscous", "load")
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """One identified parameter."""
+
+    name: str
+    value: float
+    std: float
+    """standard deviation, in the unit of the value: data and prior together"""
+    prior: float
+    """what it was before; NaN where nothing was known"""
+    unit: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Measured minus predicted torque after the parallel filter, per joint.
+
+    Attributes:
+        rms: (n,) [N m].
+        relative: (n,) |residual| / |torque| [1].
+        overall: RMS over all joints [N m].
+        relative_overall: |residual| / |torque| over all joints [1].
+        rows: rows per joint.
+        what: which data these are.
+    """
+
+    rms: Array
+    relative: Array
+    overall: float
+    relative_overall: float
+    rows: int
+    what: str
+
+    @classmethod
+    def of(cls, measured: Array, predicted: Array, what: str) -> Residuals:
+        """Figures of (M, n) torques [N m]."""
+        error = measured - predicted
+        size = np.linalg.norm(measured, axis=0)
+        return cls(
+            rms=np.sqrt(np.mean(np.square(error), axis=0)),
+            relative=np.linalg.norm(error, axis=0) / np.where(size > 0.0, size, np.nan),
+            overall=float(np.sqrt(np.mean(np.square(error)))),
+            relative_overall=float(np.linalg.norm(error)) / max(float(np.linalg.norm(measured)), 1e-300),
+            rows=len(error),
+            what=what,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Torques of one log, after the parallel filter.
+
+    Attributes:
+        time: (M,) [s] since the log's first sample.
+        measured: (M, n) effort times gain [N m].
+        predicted: (M, n) [N m], friction included.
+        dq: (M, n) [rad/s].
+        known: (M, n) False before a joint's first motion, when its friction is anyone's guess.
+    """
+
+    time: Array
+    measured: Array
+    predicted: Array
+    dq: Array
+    known: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """What :func:`fit` found. Immutable.
+
+    Attributes:
+        arm: the identified arm: link inertias, friction, rotor inertias, gains, noise, provenance.
+        parameters: table of all parameters with standard deviations.
+        base: what the data alone can tell, from weighted least squares, with standard deviations.
+        residuals: on the data of the fit.
+        held_out: on data the fit has not seen: ``validate_on``, else each log (or each third of the only log)
+            predicted from the others.
+        friction: the friction model.
+        shape: presliding distance and Stribeck velocity of each joint.
+        unseen: sentences on what the data did not show.
+        origins: what became of each log.
+        phi: (p,) the parameters as numbers; covariance: (p, p).
+        sigma: (n,) robust standard deviation of the residual [N m].
+        inflation: (n,) regression rows per independent one [1].
+        error_std: (n,) standard deviation of the prediction's error on data the fit has not seen, in motion
+            [N m]; where nothing was held out, of the fit's own residual.
+        error_inflation: (n,) rows per independent one of that error [1].
+        seconds: time the fit took, least squares alone and in all [s].
+    """
+
+    arm: Arm
+    parameters: tuple[Estimate, ...]
+    base: Base
+    residuals: Residuals
+    held_out: Residuals | None
+    friction: FrictionModel
+    shape: FrictionShape
+    unseen: tuple[str, ...]
+    origins: tuple[Origin, ...]
+    phi: Array
+    covariance: Array
+    sigma: Array
+    inflation: Array
+    error_std: Array
+    error_inflation: Array
+    cutoff: float
+    method: Method
+    seconds: tuple[float, float]
+    start: Arm
+    """the arm the fit started from"""
+
+    def predict(self, log: Log) -> Prediction:
+        """Predict a log's torques with the full model (remembered friction sign, couplings).
+
+        Raises:
+            InputError, LogError: the log does not fit the arm or holds nothing usable.
+        """
+        data = prepare(log, cutoff=self.cutoff)
+        problem = self._problem(data)
+        return Prediction(
+            time=data.time,
+            measured=problem.y,
+            predicted=problem.predict(self.phi),
+            dq=data.dq,
+            known=problem.known > 0.0,
+        )
+
+    def _problem(self, data: RegressionData) -> Problem:
+        y = data.effort * self.arm.effort.gain(self.arm.n)
+        return Builder(self.start, data, y).problem(self.friction, self.shape, self.phi)
+
+    def summary(self) -> str:
+        """Lines for people."""
+        n = self.arm.n
+        logs = f"{len(self.origins)} log" + ("s" if len(self.origins) > 1 else "")
+        lines = [
+            f"{self.arm.name}: {n} joints from {logs}, {self.residuals.rows} rows per joint, "
+            f"{self.method} fit in {self.seconds[1]:.1f} s",
+            f"base parameters: {self.base.rank} of {self.base.structural_rank} seen, "
+            f"conditioning {self.base.conditioning:.3g}",
+            "",
+            f"{'joint':<24}{'residual':>18}{'held out':>18}{'coulomb':>16}{'viscous':>16}",
+        ]
+        std = np.sqrt(np.diag(self.covariance))
+        names = {e.name: k for k, e in enumerate(self.parameters)}
+        for j, joint in enumerate(self.arm.joints):
+            held = self.held_out
+            cells = [f"{self.residuals.rms[j]:.3g} N m {self.residuals.relative[j]:6.1%}"]
+            cells.append("-" if held is None else f"{held.rms[j]:.3g} N m {held.relative[j]:6.1%}")
+            row = f"{joint.name:<24}" + "".join(f"{c:>18}" for c in cells)
+            for term in ("coulomb", "viscous"):
+                k = names[f"{joint.name}.{term}"]
+                row += f"{f'{self.phi[k]:.3g} ± {2 * std[k]:.2g}':>16}"
+            lines.append(row)
+        if self.held_out is not None:
+            lines.append(
+                f"overall {self.residuals.overall:.3g} N m ({self.residuals.relative_overall:.1%}), held out "
+                f"{self.held_out.overall:.3g} N m ({self.held_out.relative_overall:.1%}, {self.held_out.what})"
+            )
+        lines += [f"not seen: {sentence}" for sentence in self.unseen]
+        for k, origin in enumerate(self.origins):
+            lines += [f"log {k}: {note}" for note in origin.notes]
+        return "\n".join(lines)
+
+
+def fit(
+    arm: Arm,
+    logs: Log | Sequence[Log],
+    *,
+    friction: str | FrictionModel = "stribeck+load",
+    couplings: Sequence[Coupling] = (),
+    method: Method = "consistent",
+    cutoff: float | None = None,
+    effort: Sequence[str] | str | None = None,
+    weights: Sequence[float] | None = None,
+    prior: float = PRIOR,
+    validate_on: Log | Sequence[Log] | None = None,
+    cross_validate: bool = True,
+) -> Fit:
+    """Identify an arm's dynamics and friction from logs of free motion.
+
+    Args:
+        arm: kinematics, gravity, effort gains; its inertias are the prior.
+        logs: free motion, one or several logs of the same arm.
+        friction: ``coulomb``, ``stribeck``, ``load``, ``stribeck+load`` or a :class:`FrictionModel`.
+        couplings: drives that turn with several joints (with ``friction`` as a name).
+        method: ``consistent`` (links that can exist), or least squares ``irls``, ``wls``, ``ols``: then
+            ``phi`` is the solution nearest to the prior and the arm gets the nearest links that can exist.
+        cutoff: parallel low-pass [Hz]; default: from the motion, see :func:`palpate.identify.prepare`.
+        effort: name of a signal to take instead of the logs' effort [N m], e.g. a joint torque sensor's.
+        weights: per log, of its squared residuals.
+        prior: weight of the prior [1]; 1 lets a link's mass deviate by 50 % (one standard deviation).
+        validate_on: logs to report held-out residuals on.
+        cross_validate: without ``validate_on``: hold out each log in turn (one log: each third).
+
+    Raises:
+        InputError: arguments do not fit each other or the data say so (units, undeclared effort).
+        LogError: the logs hold nothing usable, or no motion.
+        MissingExtraError: without the extra ``identify``.
+    """
+    begin = time.perf_counter()
+    model = friction if isinstance(friction, FrictionModel) else FrictionModel.named(friction, couplings)
+    if method not in ("consistent", "irls", "wls", "ols"):
+        raise InputError(f"method must be consistent, irls, wls or ols, got {method!r}")
+    every = (logs,) if isinstance(logs, Log) else tuple(logs)
+    check_joints(arm, every)
+    data = prepare(every, cutoff=cutoff, effort=effort, weights=weights)
+    gain = np.ones(arm.n) if effort is not None else check_effort(arm, data)
+    check_motion(arm, data)
+    builder = Builder(arm, data, data.effort * gain)
+    problem, solution = solve_shape(builder, model, method="irls" if method == "consistent" else method)
+    base = base_parameters(problem, solution, structural_rank=structural_rank(arm, model))
+    least = time.perf_counter() - begin
+    result = _consistent(arm, problem, solution, prior)
+    phi, covariance = (result.phi, result.covariance)
+    links = phi
+    if method != "consistent":
+        phi = solution.phi
+    predicted = problem.predict(phi)
+    seen = problem.known.all(axis=1)
+    if not seen.any():  # a joint that never moves has no known friction; the others still count
+        seen = problem.known.any(axis=1)
+    residuals = Residuals.of(problem.y[seen], predicted[seen], "the fit's own data")
+    took = time.perf_counter() - begin
+    held, spread = None, _spread(problem, problem.y - predicted)
+    if validate_on is not None:
+        others = (validate_on,) if isinstance(validate_on, Log) else tuple(validate_on)
+        unseen = _problem_of(arm, others, problem, phi, data.cutoff, effort, gain)
+        held, spread = _held_out(unseen, unseen.predict(phi), "validate_on")
+    elif cross_validate:
+        held, spread = _held_out(*_cross_validate(builder, problem, method, prior))
+    estimates = _table(arm, problem, phi, covariance)
+    return Fit(
+        arm=identified(arm, problem, links, data, gain, every),
+        parameters=estimates,
+        base=base,
+        residuals=residuals,
+        held_out=held,
+        friction=model,
+        shape=problem.shape,
+        unseen=_unseen(arm, problem, base),
+        origins=data.origins,
+        phi=phi,
+        covariance=covariance,
+        sigma=solution.sigma,
+        inflation=solution.inflation,
+        error_std=spread[0],
+        error_inflation=spread[1],
+        cutoff=data.cutoff,
+        method=method,
+        seconds=(least, took),
+        start=arm,
+    )
+
+
+# -- checks -----------------------------------------------------------------------------------------------------------
+
+
+def check_joints(arm: Arm, logs: Sequence[Log]) -> None:
+    """Refuse logs of other joints, or of the same in another order.
+
+    Raises:
+        InputError: the numbers of joints differ, or the names are the arm's in another order.
+    """
+    for k, log in enumerate(logs):
+        if not isinstance(log, Log):
+            continue
+        if log.n != arm.n:
+            raise InputError(f"log {k} has {log.n} joints, arm {arm.name!r} has {arm.n}; use log.select(...)")
+        if log.joint_names != arm.joint_names and set(log.joint_names) == set(arm.joint_names):
+            raise InputError(
+                f"log {k} has the arm's joints in another order; use log.select({list(arm.joint_names)})"
+            )
+
+
+def check_effort(arm: Arm, data: RegressionData) -> Array:
+    """The gains (n,), after a look whether they can be meant.
+
+    Raises:
+        InputError: undeclared effort, or a unit that contradicts it.
+    """
+    if arm.effort.kind == "undeclared":
+        raise InputError(
+            f"arm {arm.name!r} does not say what its effort is: give Effort.torque() or "
+            "Effort.current(k_t, gear); unknown gains are found by palpate.identify.fit_gains, which needs a "
+            "log with a known load (from free motion only the ratios of torques to gains are identifiable)"
+        )
+    unit = data.effort_unit
+    if unit == "A" and arm.effort.kind == "torque":
+        raise InputError(
+            "the logs' effort is a current [A], but the arm declares torque: give Effort.current(k_t, gear)"
+        )
+    if unit == "N m" and arm.effort.kind == "current":
+        raise InputError("the logs' effort is a torque [N m], but the arm declares a current")
+    return arm.effort.gain(arm.n)
+
+
+def check_motion(arm: Arm, data: RegressionData) -> None:
+    """Refuse data without motion, and positions in degrees.
+
+    Raises:
+        LogError: no joint moves.
+        InputError: positions far beyond every joint's range.
+    """
+    span = np.ptp(data.q, axis=0)
+    if np.all(span < 1e-3):
+        raise LogError(
+            f"no joint of the {len(data.origins)} logs moves by more than 1 mrad: nothing can be identified "
+            "at rest; record a motion of every joint in both directions"
+        )
+    revolute = np.array([j.kind == "revolute" for j in arm.joints])
+    limits = np.array([max(abs(j.limits.lower), abs(j.limits.upper)) for j in arm.joints])
+    beyond = revolute & (
+        np.abs(data.q).max(axis=0) > 3.0 * np.where(np.isfinite(limits), limits, 4 * math.pi)
+    )
+    if beyond.any():
+        worst = int(np.argmax(np.where(beyond, np.abs(data.q).max(axis=0), 0.0)))
+        raise InputError(
+            f"joint {arm.joints[worst].name} reaches {np.abs(data.q[:, worst]).max():.4g} rad, its limit is "
+            f"{limits[worst]:.4g}: are the positions in degrees, or of the motor's side of the gear?"
+        )
+
+
+def _unseen(arm: Arm, problem: Problem, base: Base) -> tuple[str, ...]:
+    """What the data did not show, in words."""
+    found = []
+    data = problem.data
+    for j, joint in enumerate(arm.joints):
+        span = float(np.ptp(data.q[:, j]))
+        forward = bool(np.any(data.dq[:, j] > 0.01))
+        backward = bool(np.any(data.dq[:, j] < -0.01))
+        if span < 0.05:
+            found.append(f"{joint.name} moves by {span:.2g} rad only: its friction and inertia are guesses")
+        elif not (forward and backward):
+            found.append(
+                f"{joint.name} never reverses: its Coulomb friction and offset cannot be told apart; "
+                "record it in both directions"
+            )
+    missing = base.structural_rank - base.rank
+    if missing > 0:
+        found.append(
+            f"{missing} of {base.structural_rank} base parameters: more varied motion would show them"
+        )
+    return tuple(found)
+
+
+# -- solving ----------------------------------------------------------------------------------------------------------
+
+
+def solve_shape(builder: Builder, model: FrictionModel, *, method: str = "irls") -> tuple[Problem, Solution]:
+    """Friction shape, load torque and least squares in turn."""
+    n = builder.arm.n
+    middle = model.presliding[len(model.presliding) // 2]
+    speed = 0.1 * fastest(builder.data)
+    shape = FrictionShape((middle,) * n, tuple(speed.tolist()))
+    # the load torque is not known yet
+    problem = builder.problem(replace(model, load=False, stribeck=False), shape)
+    solution = least_squares(problem, method=method, phi0=_start(builder.arm, problem))
+    phi = solution.phi
+    searched = problem
+    for _ in range(ROUNDS):
+        shape = builder.search_shape(replace(searched, model=model), solution)
+        searched = builder.problem(model, shape, phi)
+        solution = least_squares(searched, method=method, phi0=_start(builder.arm, searched))
+        phi = solution.phi
+    return searched, solution
+
+
+def _start(arm: Arm, problem: Problem) -> Array:
+    phi0 = np.zeros(len(problem.parameters))
+    phi0[: 10 * arm.n] = prior_links(arm).ravel()
+    return phi0
+
+
+def information(problem: Problem, solution: Solution) -> tuple[Array, Array]:
+    """Normal equations in units of independent residuals, with the prior of the load-dependent friction."""
+    H, g = normal(problem, solution.weights / solution.inflation)
+    for k, p in enumerate(problem.parameters):
+        if p.kind == "load":
+            H[k, k] += 1.0 / LOAD_FRICTION_STD**2
+    return H, g
+
+
+def _consistent(arm: Arm, problem: Problem, solution: Solution, prior: float) -> ConsistentSolution:
+    H, g = information(problem, solution)
+    kinds = [p.kind for p in problem.parameters]
+    positive = [k for k, p in enumerate(problem.parameters) if p.kind in POSITIVE or p.kind == "coupling"]
+    start = np.where(np.isin(kinds, ["load"]), 0.02, np.maximum(np.abs(solution.phi), 1e-3))
+    return consistent(H, g, prior_links(arm), np.array(positive), start, gamma=prior)
+
+
+def _cross_validate(
+    builder: Builder, problem: Problem, method: str, prior: float
+) -> tuple[Problem, Array, str]:
+    """Predict each log (or third of the only one) from the others; the friction's shape is kept."""
+    data = problem.data
+    groups = np.unique(data.log)
+    if len(groups) > 1:
+        fold, what = data.log, f"each of {len(groups)} logs from the others"
+    else:
+        fold = np.minimum(3 * np.arange(len(data)) // max(1, len(data)), 2)
+        groups, what = np.arange(3), "each third from the others"
+    predicted = np.full_like(problem.y, np.nan)
+    for k in groups:
+        train = replace(problem, known=problem.known * (fold != k)[:, None])
+        solution = least_squares(
+            train,
+            method="irls" if method == "consistent" else method,
+            phi0=_start(builder.arm, train),
+        )
+        phi = solution.phi
+        if method == "consistent":
+            phi = _consistent(builder.arm, train, solution, prior).phi
+        predicted[fold == k] = problem.predict(phi)[fold == k]
+    return problem, predicted, what
+
+
+def _problem_of(
+    arm: Arm,
+    logs: Sequence[Log],
+    problem: Problem,
+    phi: Array,
+    cutoff: float,
+    effort: Sequence[str] | str | None,
+    gain: Array,
+) -> Problem:
+    name = effort if effort is None or isinstance(effort, str) else effort[0]
+    data = prepare(logs, cutoff=cutoff, effort=name)
+    return Builder(arm, data, data.effort * gain).problem(problem.model, problem.shape, phi)
+
+
+def _held_out(problem: Problem, predicted: Array, what: str) -> tuple[Residuals, tuple[Array, Array]]:
+    seen = problem.known.all(axis=1)
+    if not seen.any():
+        raise LogError(f"{what}: not every joint moves, so friction is unknown throughout")
+    return Residuals.of(problem.y[seen], predicted[seen], what), _spread(problem, problem.y - predicted)
+
+
+def _spread(problem: Problem, error: Array) -> tuple[Array, Array]:
+    """Standard deviation of the error in motion (n,) and rows per independent one (n,)."""
+    moving = problem.known * (problem.rest < 0.1)
+    rows = np.maximum(1.0, moving.sum(axis=0))
+    return np.sqrt(np.sum(np.square(error) * moving, axis=0) / rows), inflation(problem, error * moving)
+
+
+# -- results ----------------------------------------------------------------------------------------------------------
+
+
+def _table(arm: Arm, problem: Problem, phi: Array, covariance: Array) -> tuple[Estimate, ...]:
+    prior = np.full(len(phi), np.nan)
+    if arm.has_dynamics:
+        prior[: 10 * arm.n] = prior_links(arm).ravel()
+    std = np.sqrt(np.diag(covariance))
+    return tuple(
+        Estimate(p.name, float(v), float(s), float(b), p.unit)
+        for p, v, s, b in zip(problem.parameters, phi, std, prior, strict=True)
+    )
+
+
+def identified(
+    arm: Arm, problem: Problem, phi: Array, data: RegressionData, gain: Array, logs: Sequence[Log]
+) -> Arm:
+    """The arm with the links, friction, rotor inertias and noise found."""
+    joints = []
+    for i, joint in enumerate(arm.joints):
+        mass, com, inertia = body(phi[10 * i : 10 * i + 10])
+
+        def value(kind: str, i: int = i) -> float:
+            k = problem.index(kind, i)
+            return float(phi[k]) if k >= 0 else 0.0
+
+        coulomb = max(0.0, value("coulomb"))
+        static: float | None = None
+        velocity: float | None = None
+        if problem.model.stribeck:
+            static = max(0.0, coulomb + value("stribeck"))
+            velocity = problem.shape.stribeck_velocity[i]
+        # the card's friction has no memory: its smooth sign is made as narrow as the speeds seen allow
+        sign = float(np.clip(problem.shape.presliding[i] * data.cutoff, 1e-3, 1e-2))
+        resolution = _resolution(np.concatenate([log.position[:, i] for log in logs]))
+        joints.append(
+            joint.replace(
+                mass=mass,
+                com=com,
+                inertia=0.5 * (inertia + inertia.T),
+                rotor_inertia=max(0.0, value("rotor"))
+                if problem.model.rotor_inertia
+                else joint.rotor_inertia,
+                friction=Friction(
+                    coulomb=coulomb,
+                    viscous=max(0.0, value("viscous")),
+                    offset=value("offset"),
+                    static=static,
+                    stribeck_velocity=velocity,
+                    load=max(0.0, value("load")),
+                    sign_velocity=sign,
+                ),
+                sensing=replace(
+                    joint.sensing,
+                    position_resolution=resolution,
+                    torque_std=float(abs(gain[i]) * data.noise[i]),
+                ),
+            )
+        )
+    rows = sum(o.used for o in data.origins)
+    provenance = dict(arm.provenance) | {
+        "identified": f"{len(data.origins)} logs, {rows} samples, {data.cutoff:g} Hz",
+        "friction": "+".join(problem.model.terms) + ", sign remembered over a presliding distance",
+    }
+    return arm.replace(joints=tuple(joints), provenance=provenance)
+
+
+def _resolution(position: Array) -> float:
+    """Smallest step between different readings [rad]; 0 if they look continuous."""
+    values = np.unique(position)
+    if len(values) < 3:
+        return 0.0
+    step = float(np.min(np.diff(values)))
+    # a count repeats: readings on a grid have far fewer values than samples
+    return step if len(values) < 0.5 * len(position) or step > 1e-7 else 0.0
