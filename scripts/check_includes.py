@@ -30,6 +30,7 @@ ALLOWED: dict[str, set[str]] = {
     "observers": MODEL | {"filter", "kalman"},
     "payload": MODEL | {"filter"},
     "payload_filter": MODEL | {"filter", "kalman", "payload"},
+    "tare": MODEL | {"kalman"},
     "wrench": MODEL | {"filter"},
     "contact": MODEL | {"filter", "wrench"},
     "control": MODEL | {"filter", "trajectory"},
