@@ -187,7 +187,7 @@ TEST(Wrench, AHeldLoadIsRemovedAtRestAndInMotion) {
   const Arm arm(d);
   const LoadConfig held{.mass = 2.0, .com = {0.03, -0.02, 0.08}, .acceleration_time = 0.0};
   LoadTorque load(arm, held);
-  WrenchEstimator estimator(arm, {.load = held});
+  WrenchEstimator estimator(arm);
   const Vec3<double> c = arm.p_last_grasp() + arm.R_last_tip() * Vec3<double>{0.03, -0.02, 0.08};
   const Inertia<double> body = about_origin(2.0, c, Sym3<double>{});
   const Six F{12.0, -7.0, 30.0, 1.5, -2.0, 0.7};

@@ -92,8 +92,9 @@ struct Wrench {
 /// Something touches the arm where it should not be touched, or where it should.
 struct Contact {
   bool active = false;                 ///< there is a contact now
-  int link = -1;                       ///< link that is touched: the last joint that feels it moves it, counted from 0; -1: none
-  bool tip = false;                    ///< it may be at the tip: the last link, or nothing speaks against the last link
+  int link = -1;                       ///< link touched, counted from 0: the one that the last joint that feels it moves; -1: none
+  int farthest = -1;                   ///< the farthest link on which one force would explain what all joints feel; >= link
+  bool tip = false;                    ///< a force at the grasp point would explain it
   JointVector torque{};                ///< of the contact at each joint: tau_ext since the onset [N m]
   JointVector std{};                   ///< its standard deviation [N m]
   JointVector level{};                 ///< test statistic over its threshold, the larger side; 1: alarm [1]

@@ -36,7 +36,7 @@ class LoadTorque {
     }
   }
 
-  /// The newest sample, and what the estimator says of the load (used if the mass is not given).
+  /// The newest sample, and what the estimator says of the load (taken if the mass is not given and the estimator says `ok`).
   void step(const JointSample& s, const Payload& payload) noexcept {
     if (s.status == Status::non_finite || s.status == Status::time_error) return;
     if (std::isnan(config_.mass) && payload.status == Status::ok) {
@@ -100,7 +100,6 @@ struct WrenchConfig {
   double force_prior_std = 500.0;     ///< how large a force may be, each direction [N]
   double moment_prior_std = 100.0;    ///< and a moment [N m]; 0: nothing but a force acts at the point
   double singular_share = 0.1;        ///< a component is singular while its variance is above this part of the prior's [1]
-  LoadConfig load{};
 };
 
 /// MATH.md section 5:  F = (J Sigma^-1 J^T + Lambda)^-1 J Sigma^-1 (tau_ext - tau_L),   Cov(F) = (J Sigma^-1 J^T + Lambda)^-1
