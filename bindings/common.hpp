@@ -34,9 +34,9 @@ struct Output {
   explicit Output(std::vector<std::size_t> shape) {
     std::size_t size = 1;
     for (std::size_t s : shape) size *= s;
-    auto* memory = new std::vector<T>(size);
-    data = memory->data();
-    nb::capsule owner(memory, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
+    auto* memory = new T[size]();
+    data = memory;
+    nb::capsule owner(memory, [](void* p) noexcept { delete[] static_cast<T*>(p); });
     array = nb::cast(nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner));
   }
 };
@@ -67,11 +67,33 @@ inline nb::object array(const palpate::JointVector& v, int n) {
   return out.array;
 }
 
+/// Names of an enumeration's values in Python, by value.
+template <class E>
+struct Names;
+template <>
+struct Names<palpate::Solver> {
+  static constexpr std::array<const char*, 3> values{"euler", "rk4", "dormand_prince"};
+};
+template <>
+struct Names<palpate::Axes> {
+  static constexpr std::array<const char*, 2> values{"base", "tip"};
+};
+template <>
+struct Names<palpate::Point> {
+  static constexpr std::array<const char*, 2> values{"grasp", "tip"};
+};
+template <>
+struct Names<palpate::ContactSource> {
+  static constexpr std::array<const char*, 2> values{"momentum", "model_residual"};
+};
+
 /// One field of a configuration: its name, where it is, what it means.
 template <class C>
 struct Option {
   const char* name;
-  std::variant<double C::*, int C::*, bool C::*, palpate::Solver C::*> member;
+  std::variant<double C::*, int C::*, bool C::*, palpate::Solver C::*, palpate::Axes C::*, palpate::Point C::*, palpate::ContactSource C::*,
+               std::array<double, 3> C::*, palpate::JointVector C::*>
+      member;
   const char* doc;
 };
 
@@ -86,9 +108,15 @@ void bind_config(nb::module_& m, const char* name, const char* doc, std::vector<
   auto* docs = new std::string(std::move(text));
   auto get = [](const C& c, const Option<C>& option) -> nb::object {
     return std::visit([&](auto member) -> nb::object {
-      if constexpr (std::is_same_v<decltype(member), palpate::Solver C::*>) {
-        constexpr const char* names[] = {"euler", "rk4", "dormand_prince"};
-        return nb::str(names[static_cast<int>(c.*member)]);
+      using Field = std::remove_cvref_t<decltype(c.*member)>;
+      if constexpr (std::is_enum_v<Field>) {
+        return nb::str(Names<Field>::values[static_cast<std::size_t>(c.*member)]);
+      } else if constexpr (std::is_same_v<Field, std::array<double, 3>> || std::is_same_v<Field, palpate::JointVector>) {
+        std::size_t count = (c.*member).size();  // of joints: up to the last that is not zero
+        while (std::is_same_v<Field, palpate::JointVector> && count > 0 && (c.*member)[count - 1] == 0.0) --count;
+        nb::list out;
+        for (std::size_t i = 0; i < count; ++i) out.append((c.*member)[i]);
+        return nb::tuple(out);
       } else {
         return nb::cast(c.*member);
       }
@@ -110,11 +138,25 @@ void bind_config(nb::module_& m, const char* name, const char* doc, std::vector<
       std::visit([&](auto member) {
         using Field = std::remove_reference_t<decltype(c.*member)>;
         try {
-          if constexpr (std::is_same_v<Field, palpate::Solver>) {
-            const std::string solver = nb::cast<std::string>(value);
-            expect(solver == "euler" || solver == "rk4" || solver == "dormand_prince",
-                   std::string(name) + ": solver '" + solver + "'; choose from euler, rk4, dormand_prince");
-            c.*member = solver == "euler" ? palpate::Solver::euler : solver == "rk4" ? palpate::Solver::rk4 : palpate::Solver::dormand_prince;
+          if constexpr (std::is_enum_v<Field>) {
+            const std::string wanted = nb::cast<std::string>(value);
+            std::string choices;
+            bool known_value = false;
+            for (std::size_t i = 0; i < Names<Field>::values.size(); ++i) {
+              choices += (choices.empty() ? "" : ", ") + std::string(Names<Field>::values[i]);
+              if (wanted != Names<Field>::values[i]) continue;
+              c.*member = static_cast<Field>(i);
+              known_value = true;
+            }
+            expect(known_value, std::string(name) + ": " + key + " '" + wanted + "'; choose from " + choices);
+          } else if constexpr (std::is_same_v<Field, std::array<double, 3>> || std::is_same_v<Field, palpate::JointVector>) {
+            const auto numbers = nb::cast<std::vector<double>>(value);
+            constexpr bool per_joint = std::is_same_v<Field, palpate::JointVector>;
+            expect(per_joint ? numbers.size() <= static_cast<std::size_t>(palpate::max_joints) : numbers.size() == 3,
+                   std::string(name) + ": option '" + key + "': expected " + (per_joint ? "one number per joint" : "3 numbers") + ", got " +
+                       std::to_string(numbers.size()));
+            c.*member = {};
+            for (std::size_t i = 0; i < numbers.size(); ++i) (c.*member)[i] = numbers[i];
           } else {
             c.*member = nb::cast<Field>(value);
           }

@@ -16,9 +16,10 @@ ObserverConfig observer_config(const nb::object& o) {
   if (nb::isinstance<SlidingModeConfig>(o)) return nb::cast<SlidingModeConfig>(o);
   if (nb::isinstance<MomentumConfig>(o)) return nb::cast<MomentumConfig>(o);
   if (nb::isinstance<SuperTwistingConfig>(o)) return nb::cast<SuperTwistingConfig>(o);
+  if (nb::isinstance<DisturbanceKalmanConfig>(o)) return nb::cast<DisturbanceKalmanConfig>(o);
   if (nb::isinstance<ExtendedKalmanConfig>(o)) return nb::cast<ExtendedKalmanConfig>(o);
   throw nb::value_error("observer: expected None, InverseDynamicsObserver, ModelResidualObserver, SlidingModeObserver, MomentumObserver, "
-                        "MomentumSuperTwisting or ExtendedKalman");
+                        "MomentumSuperTwisting, DisturbanceKalman or ExtendedKalman");
 }
 PayloadConfig payload_config(const nb::object& o) {
   if (o.is_none()) return std::monostate{};
@@ -26,6 +27,13 @@ PayloadConfig payload_config(const nb::object& o) {
   if (nb::isinstance<RegressionConfig>(o)) return nb::cast<RegressionConfig>(o);
   if (nb::isinstance<PayloadFilterConfig>(o)) return nb::cast<PayloadFilterConfig>(o);
   throw nb::value_error("payload: expected None, JointFormula, Regression or PayloadFilter");
+}
+
+template <class C>
+std::optional<C> optional_config(const nb::object& o, const char* what, const char* expected) {
+  if (o.is_none()) return std::nullopt;
+  if (nb::isinstance<C>(o)) return nb::cast<C>(o);
+  throw nb::value_error((std::string(what) + ": expected None or " + expected).c_str());
 }
 
 void fill(RawSample& raw, int n, const double* position, const double* velocity, const double* effort, const double* model) {
@@ -55,8 +63,12 @@ const double* checked(const Rows& r, std::size_t N, int n, const char* name) {
 
 /// The pipeline with the number of joints at hand for conversions.
 struct PyPipeline {
-  PyPipeline(std::shared_ptr<const Arm> arm, const nb::object& observer, const nb::object& payload, const ConditionerConfig& conditioner)
-      : pipeline(arm, {conditioner, observer_config(observer), payload_config(payload)}), n(arm->n()) {}
+  PyPipeline(std::shared_ptr<const Arm> arm, const nb::object& observer, const nb::object& payload, const ConditionerConfig& conditioner,
+             const LoadConfig& load, const nb::object& wrench, const nb::object& contact)
+      : pipeline(arm, {conditioner, observer_config(observer), payload_config(payload), load,
+                       optional_config<WrenchConfig>(wrench, "wrench", "WrenchEstimator"),
+                       optional_config<ContactConfig>(contact, "contact", "ContactDetector")}),
+        n(arm->n()) {}
   Pipeline pipeline;
   int n;
 };
@@ -64,6 +76,93 @@ struct PyPipeline {
 struct PyTouch {
   Touch touch;
   int n;
+};
+
+template <class T, std::size_t N>
+nb::object numbers(const std::array<T, N>& a, std::vector<std::size_t> shape = {N}) {
+  Output<T> out(std::move(shape));
+  std::copy(a.begin(), a.end(), out.data);
+  return out.array;
+}
+
+/// One row per sample of a run's wrenches.
+struct WrenchRows {
+  Output<double> force, force_std, moment, moment_std, covariance, conditioning, load_mass;
+  Output<bool> singular;
+  Output<std::uint8_t> status;
+  explicit WrenchRows(std::size_t N)
+      : force({N, 3}), force_std({N, 3}), moment({N, 3}), moment_std({N, 3}), covariance({N, 6, 6}), conditioning({N}), load_mass({N}), singular({N, 6}), status({N}) {}
+  void fill(std::size_t i, const Wrench& w) noexcept {
+    for (std::size_t k = 0; k < 3; ++k) {
+      force.data[3 * i + k] = w.force[k];
+      force_std.data[3 * i + k] = w.force_std[k];
+      moment.data[3 * i + k] = w.moment[k];
+      moment_std.data[3 * i + k] = w.moment_std[k];
+    }
+    for (std::size_t k = 0; k < 36; ++k) covariance.data[36 * i + k] = w.covariance[k];
+    for (std::size_t k = 0; k < 6; ++k) singular.data[6 * i + k] = w.singular[k];
+    conditioning.data[i] = w.conditioning;
+    load_mass.data[i] = w.load_mass;
+    status.data[i] = static_cast<std::uint8_t>(w.status);
+  }
+  nb::dict dict() const {
+    nb::dict d;
+    d["force"] = force.array;
+    d["force_std"] = force_std.array;
+    d["moment"] = moment.array;
+    d["moment_std"] = moment_std.array;
+    d["covariance"] = covariance.array;
+    d["singular"] = singular.array;
+    d["conditioning"] = conditioning.array;
+    d["load_mass"] = load_mass.array;
+    d["status"] = status.array;
+    return d;
+  }
+};
+
+/// And of its contacts.
+struct ContactRows {
+  std::size_t n;
+  Output<double> torque, std, level;
+  Output<bool> active, tip;
+  Output<std::int32_t> link, farthest;
+  Output<std::uint32_t> count;
+  Output<std::int64_t> onset, alarm, release;
+  Output<std::uint8_t> status;
+  ContactRows(std::size_t N, std::size_t joints)
+      : n(joints), torque({N, n}), std({N, n}), level({N, n}), active({N}), tip({N}), link({N}), farthest({N}), count({N}), onset({N}), alarm({N}), release({N}), status({N}) {}
+  void fill(std::size_t i, const Contact& c) noexcept {
+    for (std::size_t j = 0; j < n; ++j) {
+      torque.data[i * n + j] = c.torque[j];
+      std.data[i * n + j] = c.std[j];
+      level.data[i * n + j] = c.level[j];
+    }
+    active.data[i] = c.active;
+    tip.data[i] = c.tip;
+    link.data[i] = c.link;
+    farthest.data[i] = c.farthest;
+    count.data[i] = c.count;
+    onset.data[i] = c.onset_time_ns;
+    alarm.data[i] = c.alarm_time_ns;
+    release.data[i] = c.release_time_ns;
+    status.data[i] = static_cast<std::uint8_t>(c.status);
+  }
+  nb::dict dict() const {
+    nb::dict d;
+    d["active"] = active.array;
+    d["link"] = link.array;
+    d["farthest"] = farthest.array;
+    d["tip"] = tip.array;
+    d["torque"] = torque.array;
+    d["std"] = std.array;
+    d["level"] = level.array;
+    d["count"] = count.array;
+    d["onset_time_ns"] = onset.array;
+    d["alarm_time_ns"] = alarm.array;
+    d["release_time_ns"] = release.array;
+    d["status"] = status.array;
+    return d;
+  }
 };
 
 nb::dict run(PyPipeline& p, const Times& time, const Rows& position, const OptionalRows& velocity, const Rows& effort, const OptionalRows& model) {
@@ -78,6 +177,10 @@ nb::dict run(PyPipeline& p, const Times& time, const Rows& position, const Optio
   Output<std::uint8_t> status({N}), external_status({N}), payload_status({N});
   Output<std::uint32_t> changes({N});
   Output<std::int64_t> change_time({N});
+  std::optional<WrenchRows> wrench;
+  std::optional<ContactRows> contact;
+  if (p.pipeline.config().wrench) wrench.emplace(N);
+  if (p.pipeline.config().contact) contact.emplace(N, un);
   unlocked([&] {
     RawSample raw;
     for (std::size_t i = 0; i < N; ++i) {
@@ -101,6 +204,8 @@ nb::dict run(PyPipeline& p, const Times& time, const Rows& position, const Optio
       payload_status.data[i] = static_cast<std::uint8_t>(t.payload.status);
       changes.data[i] = t.payload.changes;
       change_time.data[i] = t.payload.change_time_ns;
+      if (wrench) wrench->fill(i, t.wrench);
+      if (contact) contact->fill(i, t.contact);
     }
   });
   nb::dict d;
@@ -117,6 +222,8 @@ nb::dict run(PyPipeline& p, const Times& time, const Rows& position, const Optio
   d["payload_status"] = payload_status.array;
   d["changes"] = changes.array;
   d["change_time_ns"] = change_time.array;
+  if (wrench) d["wrench"] = wrench->dict();
+  if (contact) d["contact"] = contact->dict();
   return d;
 }
 
@@ -146,6 +253,13 @@ void bind_pipeline(nb::module_& m) {
                                    {{"max_rate", &SuperTwistingConfig::max_rate, "fastest change of tau_ext to follow [N m/s]"},
                                     {"gain", &SuperTwistingConfig::gain, "lambda = gain sqrt(max_rate) [1]"},
                                     {"friction_fraction", &SuperTwistingConfig::friction_fraction, "friction model's error in motion, part of Coulomb friction [1]"}});
+  bind_config<DisturbanceKalmanConfig>(m, "DisturbanceKalman", "Kalman filter on the momentum with tau_ext as its disturbance (Wahrburg et al. 2015); full covariance.",
+                                       {{"disturbance_rate", &DisturbanceKalmanConfig::disturbance_rate, "growth of tau_ext's standard deviation [N m/sqrt(s)]"},
+                                        {"decay", &DisturbanceKalmanConfig::decay, "tau_ext forgets itself at this rate [1/s]"},
+                                        {"disturbance_prior_std", &DisturbanceKalmanConfig::disturbance_prior_std, "of tau_ext at the start [N m]"},
+                                        {"model_torque_std", &DisturbanceKalmanConfig::model_torque_std, "model error, white per sample [N m]"},
+                                        {"friction_fraction", &DisturbanceKalmanConfig::friction_fraction, "friction model's error in motion, part of Coulomb friction [1]"},
+                                        {"friction_time", &DisturbanceKalmanConfig::friction_time, "how long such an error lasts [s]"}});
   bind_config<ExtendedKalmanConfig>(m, "ExtendedKalman", "Extended Kalman filter on (q, q') with tau_ext as states (R eqs. 9-14, corrected).",
                                     {{"disturbance", &ExtendedKalmanConfig::disturbance, "estimate tau_ext too"},
                                      {"disturbance_rate", &ExtendedKalmanConfig::disturbance_rate, "growth of tau_ext's standard deviation [N m/sqrt(s)]"},
@@ -186,6 +300,30 @@ void bind_pipeline(nb::module_& m) {
                                     {"max_step", &PayloadFilterConfig::max_step, "longer intervals are split [s]"},
                                     {"ok_relative", &PayloadFilterConfig::ok_relative, "status ok below this part of the mass [1]"},
                                     {"ok_absolute", &PayloadFilterConfig::ok_absolute, "or below this [kg]"}});
+  bind_config<LoadConfig>(m, "HeldLoad", "What is held and known, taken away before wrench and contact are judged.",
+                          {{"mass", &LoadConfig::mass, "[kg]; nan: what the payload estimator says, once it is ok"},
+                           {"com", &LoadConfig::com, "centre of mass from the grasp point, tip axes [m]; with a given mass"},
+                           {"mass_std", &LoadConfig::mass_std, "of a given mass [kg]"},
+                           {"acceleration_time", &LoadConfig::acceleration_time, "time constant of the acceleration its inertia needs [s]"}});
+  bind_config<WrenchConfig>(m, "WrenchEstimator", "Wrench at the hand: (J S^-1 J^T + prior^-1)^-1 J S^-1 tau_ext, with covariance (MATH.md section 5).",
+                            {{"axes", &WrenchConfig::axes, "of force and moment: 'base' or 'tip'"},
+                             {"point", &WrenchConfig::point, "about which the moment is: 'grasp' or 'tip'"},
+                             {"force_prior_std", &WrenchConfig::force_prior_std, "how large a force may be, each direction [N]"},
+                             {"moment_prior_std", &WrenchConfig::moment_prior_std, "and a moment [N m]; 0: a force alone acts at the point"},
+                             {"singular_share", &WrenchConfig::singular_share, "a component is singular above this part of the prior's variance [1]"}});
+  bind_config<ContactConfig>(m, "ContactDetector", "Two-sided CUSUM per joint on whitened innovations, with a stated false-alarm rate (MATH.md section 5).",
+                             {{"false_alarms_per_hour", &ContactConfig::false_alarms_per_hour, "of the whole arm, while its errors are as stated [1/h]"},
+                              {"source", &ContactConfig::source, "'momentum', or 'model_residual': the controller's own model"},
+                              {"noise_std", &ContactConfig::noise_std, "per joint: white error of the torque per sample, beside the arm's own [N m]"},
+                              {"model_std", &ContactConfig::model_std, "per joint: slow error of the model in motion, beside the friction's [N m]"},
+                              {"model_time", &ContactConfig::model_time, "how long such an error lasts in motion [s]"},
+                              {"friction_fraction", &ContactConfig::friction_fraction, "friction model's error in motion, part of Coulomb friction [1]"},
+                              {"rest_time", &ContactConfig::rest_time, "how fast friction wanders within +-F at rest [s]"},
+                              {"settle_time", &ContactConfig::settle_time, "how long friction takes to settle after rest or a reversal [s]"},
+                              {"clip", &ContactConfig::clip, "a sample counts for no more [std]"},
+                              {"contact_time", &ContactConfig::contact_time, "time constant of the contact torque reported [s]"},
+                              {"release_time", &ContactConfig::release_time, "nothing felt for so long ends a contact [s]"},
+                              {"warm_up", &ContactConfig::warm_up, "no test for so long after a start or a gap [s]"}});
   bind_config<PublishedKalmanConfig>(m, "PublishedKalman", "The filter that made the published curves, errors included. For reproduction only.",
                                      {{"Q", &PublishedKalmanConfig::Q, "process noise times the identity"},
                                       {"R", &PublishedKalmanConfig::R, "measurement noise times the identity"},
@@ -224,10 +362,42 @@ void bind_pipeline(nb::module_& m) {
       .def_prop_ro("first_moment", [](const PyTouch& t) { return nb::make_tuple(t.touch.payload.first_moment[0], t.touch.payload.first_moment[1], t.touch.payload.first_moment[2]); }, "m (c - grasp) [kg m], tip axes")
       .def_prop_ro("changes", [](const PyTouch& t) { return t.touch.payload.changes; }, "grasps and releases seen")
       .def_prop_ro("change_time_ns", [](const PyTouch& t) { return t.touch.payload.change_time_ns; })
-      .def_prop_ro("payload_status", [](const PyTouch& t) { return t.touch.payload.status; });
+      .def_prop_ro("payload_status", [](const PyTouch& t) { return t.touch.payload.status; })
+      .def_prop_ro("wrench", [](const PyTouch& t) {
+        const Wrench& w = t.touch.wrench;
+        nb::dict d;
+        d["force"] = numbers(w.force);
+        d["force_std"] = numbers(w.force_std);
+        d["moment"] = numbers(w.moment);
+        d["moment_std"] = numbers(w.moment_std);
+        d["covariance"] = numbers(w.covariance, {6, 6});
+        d["singular"] = numbers(w.singular);
+        d["conditioning"] = w.conditioning;
+        d["load_mass"] = w.load_mass;
+        d["status"] = w.status;
+        return d;
+      }, "as in run()'s rows")
+      .def_prop_ro("contact", [](const PyTouch& t) {
+        const Contact& c = t.touch.contact;
+        nb::dict d;
+        d["active"] = c.active;
+        d["link"] = c.link;
+        d["farthest"] = c.farthest;
+        d["tip"] = c.tip;
+        d["torque"] = array(c.torque, t.n);
+        d["std"] = array(c.std, t.n);
+        d["level"] = array(c.level, t.n);
+        d["count"] = c.count;
+        d["onset_time_ns"] = c.onset_time_ns;
+        d["alarm_time_ns"] = c.alarm_time_ns;
+        d["release_time_ns"] = c.release_time_ns;
+        d["status"] = c.status;
+        return d;
+      }, "as in run()'s rows");
 
   nb::class_<PyPipeline>(m, "Pipeline", "One path from samples to Touch; see palpate.Pipeline.")
-      .def(nb::init<std::shared_ptr<const Arm>, const nb::object&, const nb::object&, const ConditionerConfig&>(), nb::arg("arm"), nb::arg("observer").none(), nb::arg("payload").none(), nb::arg("conditioner"))
+      .def(nb::init<std::shared_ptr<const Arm>, const nb::object&, const nb::object&, const ConditionerConfig&, const LoadConfig&, const nb::object&, const nb::object&>(), nb::arg("arm"),
+           nb::arg("observer").none(), nb::arg("payload").none(), nb::arg("conditioner"), nb::arg("load") = LoadConfig{}, nb::arg("wrench") = nb::none(), nb::arg("contact") = nb::none())
       .def("step", [](PyPipeline& p, std::int64_t time_ns, const Vector& position, const OptionalVector& velocity, const Vector& effort, const OptionalVector& model) {
         RawSample raw;
         raw.time_ns = time_ns;

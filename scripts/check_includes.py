@@ -26,6 +26,7 @@ ALLOWED: dict[str, set[str]] = {
     "arm": BASE | {"friction"},
     "chain": BASE | {"friction", "arm"},
     "conditioner": MODEL | {"filter"},
+    "phase_currents": BASE,
     "kalman": MODEL,
     "observers": MODEL | {"filter", "kalman"},
     "payload": MODEL | {"filter"},

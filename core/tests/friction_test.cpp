@@ -101,4 +101,25 @@ TEST(Friction, ProblemNamesTheParameter) {
             "friction stribeck_velocity = nan rad/s; expected a finite number > 0, because static is given");
 }
 
+TEST(SignTravel, TwoOverAReversalHoweverSlow) {
+  for (const int steps : {1, 7, 1000}) {
+    SignTravel travel;
+    double sum = travel.step(plain, 0.2, 1e-4);
+    EXPECT_EQ(sum, 0.0);  // the first sample is where it starts
+    for (int k = 1; k <= steps; ++k) sum += travel.step(plain, 0.2 - 0.4 * k / steps, 1e-4);
+    EXPECT_GT(sum, 1.7);
+    EXPECT_LE(sum, 2.0);
+  }
+}
+
+TEST(SignTravel, NoiseAtRestAndSpeedInMotionAreNone) {
+  SignTravel rest, motion;
+  double sum = 0.0;
+  for (int k = 0; k < 1000; ++k) {
+    sum += rest.step(plain, k % 2 ? 2e-3 : -2e-3, 2e-3);
+    sum += motion.step(plain, k % 2 ? 0.3 : 0.9, 2e-3);
+  }
+  EXPECT_EQ(sum, 0.0);
+}
+
 }  // namespace

@@ -5,7 +5,10 @@ from __future__ import annotations
 from . import robots
 from ._core import (
     Conditioner,
+    ContactDetector,
+    DisturbanceKalman,
     ExtendedKalman,
+    HeldLoad,
     InverseDynamicsObserver,
     JointFormula,
     ModelResidualObserver,
@@ -15,25 +18,42 @@ from ._core import (
     Regression,
     SlidingModeObserver,
     Status,
+    WrenchEstimator,
     __version__,
 )
 from .arm import Arm, Effort, Friction, Joint, Limits, Sensing, Shape
 from .control import Controller, Quintic, SafetyLimiter, Setpoint
 from .errors import ArmError, DriverError, InputError, LogError, MissingExtraError, PalpateError
 from .logs import ColumnMap, Log, Recorder
-from .pipeline import ExternalTorque, Payload, Pipeline, Tare, Touch, status_names, tare
+from .pipeline import (
+    Contact,
+    ContactEvent,
+    ExternalTorque,
+    Payload,
+    Pipeline,
+    Tare,
+    Touch,
+    Wrench,
+    status_names,
+    tare,
+)
 
 __all__ = [
     "Arm",
     "ArmError",
     "ColumnMap",
     "Conditioner",
+    "Contact",
+    "ContactDetector",
+    "ContactEvent",
     "Controller",
+    "DisturbanceKalman",
     "DriverError",
     "Effort",
     "ExtendedKalman",
     "ExternalTorque",
     "Friction",
+    "HeldLoad",
     "InputError",
     "InverseDynamicsObserver",
     "Joint",
@@ -60,6 +80,8 @@ __all__ = [
     "Status",
     "Tare",
     "Touch",
+    "Wrench",
+    "WrenchEstimator",
     "__version__",
     "robots",
     "status_names",

@@ -13,7 +13,10 @@ import numpy.typing as npt
 from . import _core
 from ._core import (
     Conditioner,
+    ContactDetector,
+    DisturbanceKalman,
     ExtendedKalman,
+    HeldLoad,
     InverseDynamicsObserver,
     JointFormula,
     ModelResidualObserver,
@@ -23,6 +26,7 @@ from ._core import (
     Regression,
     SlidingModeObserver,
     Status,
+    WrenchEstimator,
 )
 from .arm import Arm, Array
 from .errors import ArmError, InputError, suggest
@@ -34,6 +38,7 @@ Observer = (
     | SlidingModeObserver
     | MomentumObserver
     | MomentumSuperTwisting
+    | DisturbanceKalman
     | ExtendedKalman
 )
 PayloadEstimator = JointFormula | Regression | PayloadFilter
@@ -44,6 +49,7 @@ OBSERVERS: Mapping[str, type[Any]] = {
     "sliding-mode": SlidingModeObserver,
     "momentum": MomentumObserver,
     "super-twisting": MomentumSuperTwisting,
+    "disturbance-kalman": DisturbanceKalman,
     "extended-kalman": ExtendedKalman,
 }
 ESTIMATORS: Mapping[str, type[Any]] = {
@@ -84,6 +90,105 @@ class Payload:
 
 
 @dataclass(frozen=True, slots=True)
+class Wrench:
+    """Force and moment the environment exerts on the hand, beyond the held load; of one sample, or one row per sample.
+
+    Axes and point are those of the :class:`WrenchEstimator`. Signs: > 0 pushes the arm along the axis.
+    """
+
+    force: Array
+    """(3,) or (N, 3) [N]"""
+    force_std: Array
+    """(3,) or (N, 3) standard deviation [N]"""
+    moment: Array
+    """(3,) or (N, 3) about the point [N m]; zero where only a force is estimated"""
+    moment_std: Array
+    """(3,) or (N, 3) standard deviation [N m]"""
+    covariance: Array
+    """(6, 6) or (N, 6, 6) force before moment [N^2, N^2 m, N^2 m^2]"""
+    singular: npt.NDArray[np.bool_]
+    """(6,) or (N, 6): the pose tells (almost) nothing about this component"""
+    conditioning: Any
+    """float or (N,): best over worst known direction, >= 1; inf: one is not seen"""
+    load_mass: Any
+    """float or (N,): of the load whose weight and inertia were taken away [kg]"""
+    status: Any
+    """Status, or (N,) uint8; singular: some component is"""
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """Whether something touches the arm, and where; of one sample, or one row per sample."""
+
+    active: Any
+    """bool or (N,)"""
+    link: Any
+    """int or (N,): the link touched, counted from 0: the one moved by the last joint that feels it; -1: none"""
+    farthest: Any
+    """int or (N,): the farthest link on which one force would explain what all joints feel; >= link"""
+    tip: Any
+    """bool or (N,): a force at the grasp point would explain what all joints feel"""
+    torque: Array
+    """(n,) or (N, n) of the contact at each joint [N m]"""
+    std: Array
+    """(n,) or (N, n) standard deviation [N m]"""
+    level: Array
+    """(n,) or (N, n) test statistic over its threshold; 1: alarm"""
+    count: Any
+    """int or (N,): contacts since the start"""
+    onset_time_ns: Any
+    """int or (N,): estimated start of the newest one [ns]"""
+    alarm_time_ns: Any
+    """int or (N,): when it was declared [ns]"""
+    release_time_ns: Any
+    """int or (N,): estimated end of the newest one that ended [ns]"""
+    status: Any
+    """Status, or (N,) uint8"""
+
+    def events(self) -> list[ContactEvent]:
+        """The contacts of a run, in order of time. For rows, not for one sample."""
+        active = np.asarray(self.active)
+        found = []
+        for number in np.unique(self.count[active]):
+            rows = np.flatnonzero(active & (self.count == number))
+            last = rows[-1]
+            ended = last + 1 < len(active)
+            clearest = rows[np.abs(self.torque[rows] / self.std[rows]).max(axis=1).argmax()]
+            found.append(
+                ContactEvent(
+                    onset_time_ns=int(self.onset_time_ns[last]),
+                    alarm_time_ns=int(self.alarm_time_ns[last]),
+                    release_time_ns=int(self.release_time_ns[last + 1]) if ended else None,
+                    link=int(self.link[last]),
+                    farthest=int(self.farthest[clearest]),
+                    tip=bool(self.tip[clearest]),
+                    torque=np.array(self.torque[clearest]),
+                )
+            )
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class ContactEvent:
+    """One contact, from its onset to its release."""
+
+    onset_time_ns: int
+    """estimated start [ns]"""
+    alarm_time_ns: int
+    """when it was declared [ns]"""
+    release_time_ns: int | None
+    """estimated end [ns]; None: it lasted until the end of the run"""
+    link: int
+    """the link touched, counted from 0: the one moved by the last joint that feels it"""
+    farthest: int
+    """the farthest link on which one force would explain what all joints feel"""
+    tip: bool
+    """a force at the grasp point would explain it"""
+    torque: Array
+    """(n,) [N m] at its clearest sample"""
+
+
+@dataclass(frozen=True, slots=True)
 class Touch:
     """Everything known after a sample; of one sample, or one row per sample.
 
@@ -100,10 +205,14 @@ class Touch:
     """of the sample itself: Status, or (N,) uint8"""
     external: ExternalTorque
     payload: Payload
+    wrench: Wrench | None = None
+    """None: not asked for"""
+    contact: Contact | None = None
+    """None: not asked for"""
 
 
 class Pipeline:
-    """One path from samples to :class:`Touch`: conditioner, observer, payload estimator.
+    """One path from samples to :class:`Touch`: conditioner, observer, payload estimator, wrench and contact.
 
     Live, simulated, replayed and batch data go through the same C++ code; the same samples give the same bits.
 
@@ -112,6 +221,9 @@ class Pipeline:
         observer: turns samples into external torque; None: not wanted.
         payload: weighs; None: not wanted. The default needs no observer. JointFormula and Regression do.
         conditioner: velocity from the driver or differentiated, longest gap.
+        wrench: turns the external torque into force and moment at the hand; needs an observer. None: not wanted.
+        contact: detects contacts, with its own residual. None: not wanted.
+        load: what is held and known, taken away before wrench and contact; by default what `payload` finds.
 
     Raises:
         ArmError: the effort is not declared, or masses are missing where they are needed.
@@ -125,6 +237,9 @@ class Pipeline:
         observer: Observer | None = None,
         payload: PayloadEstimator | None = PayloadFilter(first_moment=True, offset_prior_std=0.02),  # noqa: B008
         conditioner: Conditioner | None = None,
+        wrench: WrenchEstimator | None = None,
+        contact: ContactDetector | None = None,
+        load: HeldLoad | None = None,
     ) -> None:
         if arm.effort.kind == "undeclared":
             raise ArmError(
@@ -135,8 +250,17 @@ class Pipeline:
         self.observer = observer
         self.payload = payload
         self.conditioner = conditioner or Conditioner()
+        self.wrench = wrench
+        self.contact = contact
+        self.load_config = load or HeldLoad()
+        for name in ("noise_std", "model_std") if contact is not None else ():
+            given = len(getattr(contact, name))
+            if given > arm.n:
+                raise InputError(f"ContactDetector {name}: {given} numbers, arm {arm.name!r} has {arm.n} joints")
         try:
-            self._core = _core.Pipeline(arm.core, observer, payload, self.conditioner)
+            self._core = _core.Pipeline(
+                arm.core, observer, payload, self.conditioner, self.load_config, wrench, contact
+            )
         except ValueError as e:
             raise InputError(str(e)) from None
 
@@ -166,6 +290,8 @@ class Pipeline:
                 t.change_time_ns,
                 t.payload_status,
             ),
+            None if self.wrench is None else Wrench(**t.wrench),
+            None if self.contact is None else Contact(**t.contact),
         )
 
     def run(self, log: Log) -> Touch:
@@ -199,6 +325,8 @@ class Pipeline:
                 r["change_time_ns"],
                 r["payload_status"],
             ),
+            None if self.wrench is None else Wrench(**r["wrench"]),
+            None if self.contact is None else Contact(**r["contact"]),
         )
 
     @property
@@ -216,6 +344,9 @@ class Pipeline:
             "observer": _describe(self.observer, OBSERVERS),
             "payload": _describe(self.payload, ESTIMATORS),
             "conditioner": self.conditioner.options(),
+            "wrench": _plain(self.wrench),
+            "contact": _plain(self.contact),
+            "load": _plain(self.load_config),
         }
 
     @classmethod
@@ -231,6 +362,9 @@ class Pipeline:
                 observer=_build(options.get("observer"), OBSERVERS, "observer"),
                 payload=_build(options.get("payload"), ESTIMATORS, "estimator"),
                 conditioner=Conditioner(**options.get("conditioner", {})),
+                wrench=_made(WrenchEstimator, options.get("wrench")),
+                contact=_made(ContactDetector, options.get("contact")),
+                load=_made(HeldLoad, options.get("load")),
             )
         except (TypeError, ValueError) as e:
             raise InputError(f"pipeline options: {str(e).splitlines()[0]}") from None
@@ -240,11 +374,24 @@ def _describe(config: Any, kinds: Mapping[str, type[Any]]) -> dict[str, Any] | N
     if config is None:
         return None
     name = next(name for name, kind in kinds.items() if isinstance(config, kind))
-    values = config.options()
+    return {"name": name, **(_plain(config) or {})}
+
+
+def _plain(config: Any) -> dict[str, Any] | None:
+    """A configuration's options, fit for JSON, where nan cannot be written."""
+    if config is None:
+        return None
+    values = config.options().items()
     return {
-        "name": name,
-        **{k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()},
+        k: None if isinstance(v, float) and math.isnan(v) else list(v) if isinstance(v, tuple) else v
+        for k, v in values
     }
+
+
+def _made(kind: type[Any], options: Mapping[str, Any] | None) -> Any:
+    if options is None:
+        return None
+    return kind(**{k: math.nan if v is None else v for k, v in options.items()})
 
 
 def _build(options: Mapping[str, Any] | None, kinds: Mapping[str, type[Any]], what: str) -> Any:
@@ -254,7 +401,7 @@ def _build(options: Mapping[str, Any] | None, kinds: Mapping[str, type[Any]], wh
     name = values.pop("name", "")
     if name not in kinds:
         raise InputError(f"no {what} {name!r}; {suggest(str(name), kinds, 'there are')}")
-    return kinds[name](**{k: math.nan if v is None else v for k, v in values.items()})
+    return _made(kinds[name], values)
 
 
 @dataclass(frozen=True, slots=True)

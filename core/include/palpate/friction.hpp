@@ -86,4 +86,31 @@ struct Friction {
   }
 };
 
+/// How far a joint has gone through its friction's sign since it was last asked, in tanh(dq/v_0): 0 at rest and in steady
+/// motion, 2 in all over a reversal, 1 over a start or a stop.
+///
+/// What the friction model gets wrong at one sign says little about the other, so an error is renewed in proportion to this.
+/// Steps smaller than 0.3, or than four standard deviations of the noise, are saved up: summing the noise of dq at rest would
+/// renew the error at every sample.
+class SignTravel {
+ public:
+  /// dq, dq_std [rad/s].
+  double step(const Friction& friction, double dq, double dq_std) noexcept {
+    const double sign = std::tanh(dq / friction.sign_velocity);
+    const double travel = std::abs(sign - at_);
+    if (!started_) {
+      started_ = true;
+      at_ = sign;
+      return 0.0;
+    }
+    if (travel < std::fmax(0.3, std::fmin(4.0 * dq_std / friction.sign_velocity, 0.9))) return 0.0;
+    at_ = sign;
+    return travel;
+  }
+
+ private:
+  double at_ = 0.0;
+  bool started_ = false;
+};
+
 }  // namespace palpate

@@ -1,9 +1,12 @@
 // Pipeline: one raw sample in, everything known about touch out. The only path, live, simulated, replayed and in batch.
 #pragma once
 #include <memory>
+#include <optional>
 #include <variant>
 
 #include "palpate/conditioner.hpp"
+#include "palpate/contact.hpp"
+#include "palpate/observers/disturbance_kalman.hpp"
 #include "palpate/observers/extended_kalman.hpp"
 #include "palpate/observers/inverse_dynamics.hpp"
 #include "palpate/observers/momentum.hpp"
@@ -11,12 +14,13 @@
 #include "palpate/observers/sliding_mode.hpp"
 #include "palpate/payload.hpp"
 #include "palpate/payload_filter.hpp"
+#include "palpate/wrench.hpp"
 
 namespace palpate {
 
 /// Which observer, if any, turns samples into external torque; its configuration chooses it.
 using ObserverConfig = std::variant<std::monostate, InverseDynamicsConfig, ModelResidualConfig, SlidingModeConfig, MomentumConfig,
-                                    SuperTwistingConfig, ExtendedKalmanConfig>;
+                                    SuperTwistingConfig, DisturbanceKalmanConfig, ExtendedKalmanConfig>;
 /// Which estimator, if any, weighs.
 using PayloadConfig = std::variant<std::monostate, JointFormulaConfig, RegressionConfig, PayloadFilterConfig>;
 
@@ -24,16 +28,19 @@ struct PipelineConfig {
   ConditionerConfig conditioner{};
   ObserverConfig observer{};
   PayloadConfig payload{PayloadFilterConfig{}};
+  LoadConfig load{};                      ///< what wrench and contact take away as held
+  std::optional<WrenchConfig> wrench{};   ///< needs an observer
+  std::optional<ContactConfig> contact{};
 };
 
-/// RawSample -> Conditioner -> observer -> payload estimator -> Touch (DESIGN.md section 1).
+/// RawSample -> Conditioner -> observer -> payload estimator -> wrench, contact -> Touch (DESIGN.md section 1).
 ///
 /// step() allocates nothing, throws nothing, locks nothing and reads no clock; its work is bounded by the number of joints.
 /// The same samples give the same bits, one by one or in batches.
 class Pipeline {
  public:
   Pipeline(std::shared_ptr<const Arm> arm, const PipelineConfig& config)
-      : arm_(std::move(arm)), config_(config), conditioner_(arm_->n(), gains(*arm_), config.conditioner) {
+      : arm_(std::move(arm)), config_(config), conditioner_(arm_->n(), gains(*arm_), config.conditioner), load_(*arm_, config.load) {
     make();
   }
 
@@ -53,8 +60,22 @@ class Pipeline {
     touch.dq = s.dq;
     touch.external.status = Status::held;
     touch.payload.status = Status::held;
+    touch.wrench.status = Status::held;
+    touch.contact.status = Status::held;
     std::visit([&](auto& observer) { observe(observer, s, touch); }, observer_);
     std::visit([&](auto& estimator) { weigh(estimator, s, touch); }, payload_);
+    if (wrench_ || contact_) {
+      // A contact looks like a load to the payload estimators: what was held before it is what is held.
+      load_.step(s, touched_ ? Payload{} : touch.payload);
+      if (contact_) {
+        touch.contact = contact_->step(s, load_);
+        touched_ = touch.contact.active;
+      }
+      if (wrench_) {
+        const JointMatrix sigma = std::visit([&](const auto& observer) { return covariance(observer, touch.external); }, observer_);
+        touch.wrench = wrench_->step(s.q, touch.external, sigma, load_);
+      }
+    }
     return touch;
   }
 
@@ -90,8 +111,13 @@ class Pipeline {
   }
 
   void make() {
-    weighed_ = false;
+    weighed_ = touched_ = false;
     const Arm& arm = *arm_;
+    load_.reset();
+    wrench_.reset();
+    contact_.reset();
+    if (config_.wrench) wrench_.emplace(arm, *config_.wrench);
+    if (config_.contact) contact_.emplace(arm, *config_.contact);
     struct {
       const Arm& arm;
       decltype(observer_)& to;
@@ -101,6 +127,7 @@ class Pipeline {
       void operator()(const SlidingModeConfig& c) const { to.emplace<SlidingModeObserver>(arm, c); }
       void operator()(const MomentumConfig& c) const { to.emplace<MomentumObserver>(arm, c); }
       void operator()(const SuperTwistingConfig& c) const { to.emplace<MomentumSuperTwisting>(arm, c); }
+      void operator()(const DisturbanceKalmanConfig& c) const { to.emplace<DisturbanceKalman>(arm, c); }
       void operator()(const ExtendedKalmanConfig& c) const { to.emplace<ExtendedKalman>(arm, c); }
     } observer_maker{arm, observer_};
     std::visit(observer_maker, config_.observer);
@@ -120,6 +147,20 @@ class Pipeline {
     const bool needs_torque = std::holds_alternative<JointFormulaConfig>(config_.payload) || std::holds_alternative<RegressionConfig>(config_.payload);
     if (needs_torque && std::holds_alternative<std::monostate>(config_.observer))
       throw std::invalid_argument("Pipeline: the joint formula and the regression weigh an external torque; choose an observer too");
+    if (config_.wrench && std::holds_alternative<std::monostate>(config_.observer))
+      throw std::invalid_argument("Pipeline: the wrench is made of an external torque; choose an observer too");
+  }
+
+  /// The observer's own covariance where it has one, else its variances.
+  template <class Observer>
+  JointMatrix covariance(const Observer& observer, const ExternalTorque& external) const noexcept {
+    if constexpr (requires { observer.covariance(); }) {
+      return observer.covariance();
+    } else {
+      JointMatrix out{};
+      for (int j = 0; j < arm_->n(); ++j) out(j, j) = external.std[detail::at(j)] * external.std[detail::at(j)];
+      return out;
+    }
   }
 
   void observe(std::monostate, const JointSample&, Touch&) noexcept {}
@@ -149,10 +190,13 @@ class Pipeline {
   PipelineConfig config_;
   Conditioner conditioner_;
   std::variant<std::monostate, InverseDynamicsObserver, ModelResidualObserver, SlidingModeObserver, MomentumObserver, MomentumSuperTwisting,
-               ExtendedKalman>
+               DisturbanceKalman, ExtendedKalman>
       observer_;
   std::variant<std::monostate, JointFormula, Regression, PayloadFilter> payload_;
-  bool weighed_ = false;
+  LoadTorque load_;
+  std::optional<WrenchEstimator> wrench_;
+  std::optional<ContactDetector> contact_;
+  bool weighed_ = false, touched_ = false;
 };
 
 }  // namespace palpate

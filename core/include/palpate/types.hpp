@@ -71,6 +71,41 @@ struct Payload {
   Status status = Status::warming;
 };
 
+/// Whose axes a wrench is written in, and about which point its moment is.
+enum class Axes : std::uint8_t { base = 0, tip = 1 };
+enum class Point : std::uint8_t { grasp = 0, tip = 1 };
+
+/// Force and moment the environment exerts on the last link, beyond what the held load does.
+struct Wrench {
+  std::array<double, 3> force{};       ///< [N], in `axes`
+  std::array<double, 3> moment{};      ///< about `point` [N m], in `axes`; zero where only a force is estimated
+  std::array<double, 3> force_std{};   ///< [N]
+  std::array<double, 3> moment_std{};  ///< [N m]
+  std::array<double, 36> covariance{}; ///< row-major 6 x 6, force before moment [N^2, N^2 m, N^2 m^2]
+  std::array<bool, 6> singular{};      ///< the pose tells (almost) nothing about this component
+  double conditioning = 0.0;           ///< best over worst known direction of the wrench, >= 1; infinity: one is not seen [1]
+  double load_mass = 0.0;              ///< of the load whose weight and inertia were taken away [kg]
+  Axes axes = Axes::base;
+  Point point = Point::grasp;
+  Status status = Status::warming;     ///< singular: some component is; `singular` tells which
+};
+
+/// Something touches the arm where it should not be touched, or where it should.
+struct Contact {
+  bool active = false;                 ///< there is a contact now
+  int link = -1;                       ///< link touched, counted from 0: the one that the last joint that feels it moves; -1: none
+  int farthest = -1;                   ///< the farthest link on which one force would explain what all joints feel; >= link
+  bool tip = false;                    ///< a force at the grasp point would explain it
+  JointVector torque{};                ///< of the contact at each joint: tau_ext since the onset [N m]
+  JointVector std{};                   ///< its standard deviation [N m]
+  JointVector level{};                 ///< test statistic over its threshold, the larger side; 1: alarm [1]
+  std::uint32_t count = 0;             ///< contacts since reset
+  std::int64_t onset_time_ns = 0;      ///< estimated start of the newest one [ns]; meaningless if count == 0
+  std::int64_t alarm_time_ns = 0;      ///< when it was declared [ns]
+  std::int64_t release_time_ns = 0;    ///< estimated end of the newest one that ended [ns]; meaningless if none did
+  Status status = Status::warming;
+};
+
 /// Everything known after one sample.
 struct Touch {
   std::int64_t time_ns = 0;
@@ -78,6 +113,8 @@ struct Touch {
   JointVector dq{};             ///< estimated velocity [rad/s]
   ExternalTorque external{};
   Payload payload{};
+  Wrench wrench{};
+  Contact contact{};
   Status status = Status::warming;  ///< of the sample itself
 };
 
