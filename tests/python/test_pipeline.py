@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -43,7 +43,9 @@ def flat(touch: pp.Touch) -> dict[str, np.ndarray]:
     found = {}
     for f in fields(touch):
         value = getattr(touch, f.name)
-        if f.name in ("external", "payload"):
+        if value is None:  # not asked for
+            continue
+        if is_dataclass(value):
             found |= {f"{f.name}.{g.name}": np.asarray(getattr(value, g.name)) for g in fields(value)}
         else:
             found[f.name] = np.asarray(value)
@@ -271,16 +273,11 @@ def test_options_come_back(observer: str | None, payload: str | None, arm: pp.Ar
     assert pp.Pipeline.from_options(arm, json.loads(text)).options() == options
 
 
-def test_import_is_fast_and_needs_numpy_alone() -> None:
+def test_import_needs_numpy_alone() -> None:
+    """How long it takes is measured by `palpate bench replay`."""
     code = (
-        "import numpy, time, sys; before = set(sys.modules); t = time.perf_counter(); import palpate; "
-        "t = time.perf_counter() - t; "
-        "print(t, *sorted({m.split('.')[0] for m in set(sys.modules) - before} - set(sys.stdlib_module_names)))"
+        "import numpy, sys; before = set(sys.modules); import palpate; "
+        "print(*sorted({m.split('.')[0] for m in set(sys.modules) - before} - set(sys.stdlib_module_names)))"
     )
-    times = []
-    for _ in range(3):
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        seconds, *modules = done.stdout.split()
-        assert set(modules) <= {"palpate", "numpy"}
-        times.append(float(seconds))
-    assert min(times) <= 0.1, f"import palpate took {min(times):.3f} s after numpy"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) <= {"palpate", "numpy"}

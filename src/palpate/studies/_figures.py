@@ -60,12 +60,12 @@ def curves(
         ax = figure.add_subplot()
         _plot(ax, lines, log)
         if band is not None:
-            edges = [values[:: max(1, len(values) // _POINTS)] for values in band]
-            ax.fill_between(*edges, color=colour(0), alpha=0.2, linewidth=0.0)
+            x, low, high = np.array(band)[:, :: max(1, len(band[0]) // _POINTS)]
+            ax.fill_between(x, low, high, color=colour(0), alpha=0.2, linewidth=0.0)
         if level is not None:
             ax.axhline(level[0], color=LIGHT["ink"], linewidth=0.8, linestyle=(0, (4, 3)), label=level[1])
-        for name, (x, y) in (marks or {}).items():
-            ax.plot(x, y, "o", color=LIGHT["ink"], markersize=4, fillstyle="none", label=name, zorder=5)
+        for name, points in (marks or {}).items():
+            ax.plot(*points, "o", color=LIGHT["ink"], markersize=4, fillstyle="none", label=name, zorder=5)
         if limits is not None:
             ax.set_xlim(*limits[:2])
             ax.set_ylim(*limits[2:])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from .._core import Status
 from ..arm import Array
@@ -62,7 +63,7 @@ class Seen(NamedTuple):
     time: Array
     mass: Array
     """(N,) [kg]"""
-    ok: Array
+    ok: npt.NDArray[np.bool_]
     """(N,) whether the status was ok"""
     events: tuple[Happened, ...]
     false: tuple[float, ...]
@@ -92,7 +93,11 @@ def measure(job: Job) -> list[Seen]:
             mass, changes, ok = touches[:, 0], touches[:, 2], touches[:, 3] == float(Status.ok)
         elif loop is None or job.quiet:
             payload = motion.weigh(pipeline).payload
-            mass, changes, ok = payload.mass, payload.changes.astype(np.float64), payload.status == int(Status.ok)
+            mass, changes, ok = (
+                payload.mass,
+                payload.changes.astype(np.float64),
+                payload.status == int(Status.ok),
+            )
         else:
             continue
         time = motion.time

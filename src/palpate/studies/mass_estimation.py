@@ -372,26 +372,40 @@ def _draw(
             "with noise": (motion.time, estimates[1.0].mass),
             "without": (found[long].motion.time, found[long].estimates[1.0].mass),
         },
-        "mass [kg]", level=(MASS, "true"), marks=marks, limits=(0.0, _bench.SECONDS, -0.02, 0.42),
+        "mass [kg]",
+        level=(MASS, "true"),
+        marks=marks,
+        limits=(0.0, _bench.SECONDS, -0.02, 0.42),
     )
     figures["Model wrong by 20 % (figure 12)"] = _figures.curves(
         {f"masses x {factor:g}": (motion.time, e.mass) for factor, e in estimates.items()},
-        "mass [kg]", level=(MASS, "true"), limits=(0.0, _bench.SECONDS, -0.02, 0.42),
+        "mass [kg]",
+        level=(MASS, "true"),
+        limits=(0.0, _bench.SECONDS, -0.02, 0.42),
     )
     if moved:
         by_lever = {0.205 + job.offset: found[job] for job in sorted([*moved, long], key=lambda j: j.offset)}
         figures["Object moved along the gripper (figure 13), without noise"] = _figures.curves(
-            {f"{1e3 * lever:.0f} mm": (f.motion.time, f.estimates[1.0].mass) for lever, f in by_lever.items()},
-            "mass [kg]", level=(MASS, "true"), limits=(0.0, _bench.SECONDS, -0.02, 0.5),
+            {
+                f"{1e3 * lever:.0f} mm": (f.motion.time, f.estimates[1.0].mass)
+                for lever, f in by_lever.items()
+            },
+            "mass [kg]",
+            level=(MASS, "true"),
+            limits=(0.0, _bench.SECONDS, -0.02, 0.5),
         )
     if poses:
         figures["All poses, with noise"] = _figures.curves(
             {job.pose: (found[job].motion.time, found[job].estimates[1.0].mass) for job in [*poses, goal]},
-            "mass [kg]", level=(MASS, "true"), limits=(0.0, _bench.SECONDS, -0.1, 0.5),
+            "mass [kg]",
+            level=(MASS, "true"),
+            limits=(0.0, _bench.SECONDS, -0.1, 0.5),
         )
     k = found[katana]
     figures["Katana (figure 16)"] = _figures.curves(
         {"estimated": (k.motion.time, k.estimates[1.0].mass)},
-        "mass [kg]", level=(KATANA_MASS, "true"), limits=(0.0, _bench.SECONDS, -0.05, 0.25),
+        "mass [kg]",
+        level=(KATANA_MASS, "true"),
+        limits=(0.0, _bench.SECONDS, -0.05, 0.25),
     )
     return figures
