@@ -36,7 +36,12 @@ DATA = Path(os.environ.get("PALPATE_DATA", Path(__file__).parents[1] / ".." / "s
 UR = DATA / "ur10e_innopolis"
 GAIN = np.array([11.976, 11.976, 9.839, 10.763, 10.763, 10.763])
 MASS = 2.805
-FREE = ("ur-20_01_31-unload", "ur-20_02_10-30sec_12harm", "ur-20_02_12-40sec_12harm", "ur-20_02_19_14harm50sec")
+FREE = (
+    "ur-20_01_31-unload",
+    "ur-20_02_10-30sec_12harm",
+    "ur-20_02_12-40sec_12harm",
+    "ur-20_02_19_14harm50sec",
+)
 LOADED = ("ur-20_01_31-load", "ur-20_02_19_14harm50secLoad")
 TX40_COULOMB = np.array([7.14, 8.26, 6.34, 2.48, 3.03, 0.282])
 
@@ -158,7 +163,9 @@ def show_card(found: Fit, log: Log) -> None:
         rigid = arm.inverse_dynamics(s.q, s.dq, s.ddq)
         inner = rigid - s.ddq * [j.rotor_inertia for j in arm.joints]
         sign = np.tanh(s.dq / [j.friction.sign_velocity for j in arm.joints])
-        return rigid + arm.friction_torque(s.dq) + [j.friction.load for j in arm.joints] * np.abs(inner) * sign
+        return (
+            rigid + arm.friction_torque(s.dq) + [j.friction.load for j in arm.joints] * np.abs(inner) * sign
+        )
 
     predicted = data.reduce(torque)
     measured = data.effort * arm.effort.gain(arm.n)
@@ -209,7 +216,9 @@ def report_load() -> None:
     for k, name in enumerate(FREE):
         part = fit(arm, free[:k] + free[k + 1 :])
         e = estimate_load(part, free[k])
-        print(f"false mass on {name}, fitted on the other three: {1e3 * e.mass:+.0f} g, std {1e3 * e.mass_std:.0f} g")
+        print(
+            f"false mass on {name}, fitted on the other three: {1e3 * e.mass:+.0f} g, std {1e3 * e.mass_std:.0f} g"
+        )
 
 
 def report_tx40() -> None:

@@ -256,7 +256,9 @@ class Pipeline:
         for name in ("noise_std", "model_std") if contact is not None else ():
             given = len(getattr(contact, name))
             if given > arm.n:
-                raise InputError(f"ContactDetector {name}: {given} numbers, arm {arm.name!r} has {arm.n} joints")
+                raise InputError(
+                    f"ContactDetector {name}: {given} numbers, arm {arm.name!r} has {arm.n} joints"
+                )
         try:
             self._core = _core.Pipeline(
                 arm.core, observer, payload, self.conditioner, self.load_config, wrench, contact

@@ -38,7 +38,7 @@ PIPELINES = {
 
 
 def golden_log() -> tuple[pp.Arm, pp.Log]:
-    """Justina's arm swinging with 0.2 kg, by the core's own inverse dynamics: no simulator whose update could change it."""
+    """Justina with 0.2 kg, by the core's own inverse dynamics: no simulator whose update could change it."""
     arm = pp.robots.load("justina_left_arm")
     t = np.arange(600) * 0.004
     phase = np.arange(7) * 0.7
@@ -92,7 +92,9 @@ def test_outputs_are_the_committed_ones(name):
     for what, numbers in expected.items():
         for k, (a, b) in enumerate(zip(got[what], numbers, strict=True)):
             # Other compilers and libm's exp, tanh may round the last digits otherwise.
-            assert math.isclose(a, b, rel_tol=1e-7, abs_tol=1e-10), f"{what}[{k}]: {a!r} is not the committed {b!r}"
+            assert math.isclose(a, b, rel_tol=1e-7, abs_tol=1e-10), (
+                f"{what}[{k}]: {a!r} is not the committed {b!r}"
+            )
 
 
 if __name__ == "__main__":
