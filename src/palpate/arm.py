@@ -22,7 +22,7 @@ from .errors import ArmError
 if TYPE_CHECKING:
     from os import PathLike
 
-    from . import _core
+    from ._core import Arm as CoreArm
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -705,7 +705,7 @@ class Arm(_Record):
     # --- model ----------------------------------------------------------------------------------------------
 
     @property
-    def core(self) -> _core.Arm:
+    def core(self) -> CoreArm:
         """The C++ model, built on first use.
 
         An undeclared effort is passed on as gain 1; who feeds driver samples must ask ``effort.gain(n)``.
@@ -714,8 +714,8 @@ class Arm(_Record):
             object.__setattr__(self, "_core", self._build_core())
         return self._core
 
-    def _build_core(self) -> _core.Arm:
-        from . import _core
+    def _build_core(self) -> CoreArm:
+        from ._core import Arm as CoreArm
 
         def optional(value: float | None) -> float:
             return math.nan if value is None else value
@@ -746,7 +746,7 @@ class Arm(_Record):
         ]
         limits = [(x.lower, x.upper, x.velocity, x.effort) for x in (j.limits for j in joints)]
         try:
-            return _core.Arm(
+            return CoreArm(
                 self.n,
                 np.stack([j.T_parent_joint for j in joints]),
                 np.stack([j.axis for j in joints]),

@@ -7,8 +7,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from . import _core
+from ._core import FeedforwardPd as CoreController
 from ._core import Load, Status
+from ._core import Quintic as CoreQuintic
+from ._core import SafetyLimiter as CoreLimiter
 from .arm import Arm, Array
 from .errors import InputError
 
@@ -62,7 +64,7 @@ class Quintic:
         if np.array_equal(q0, q1):
             duration = 0.0
         try:
-            self._core = _core.Quintic(np.ascontiguousarray(q0), q1, float(duration))
+            self._core = CoreQuintic(np.ascontiguousarray(q0), q1, float(duration))
         except ValueError as e:
             raise InputError(str(e)) from None
         self.duration = float(duration)
@@ -100,7 +102,7 @@ class Controller:
         n = arm.n
         bound = [j.limits.effort for j in arm.joints] if limit is None else limit
         try:
-            self._core = _core.FeedforwardPd(
+            self._core = CoreController(
                 arm.core, _joints(kp, n, "kp"), _joints(kd, n, "kd"), _joints(bound, n, "limit"), feedforward
             )
         except ValueError as e:
@@ -149,7 +151,7 @@ class SafetyLimiter:
         if damping is None:
             damping = np.where(np.isfinite(speed), bound / np.where(np.isfinite(speed), speed, 1.0), bound)
         try:
-            self._core = _core.SafetyLimiter(
+            self._core = CoreLimiter(
                 bound,
                 _joints(torque_rate, n, "torque_rate"),
                 np.array([x.lower for x in limits]),

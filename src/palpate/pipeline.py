@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from . import _core
 from ._core import (
     Conditioner,
     ContactDetector,
@@ -28,6 +27,9 @@ from ._core import (
     Status,
     WrenchEstimator,
 )
+from ._core import Load as CoreLoad
+from ._core import Pipeline as CorePipeline
+from ._core import tare as core_tare
 from .arm import Arm, Array
 from .errors import ArmError, InputError, suggest
 from .logs import Log, Sample
@@ -260,7 +262,7 @@ class Pipeline:
                     f"ContactDetector {name}: {given} numbers, arm {arm.name!r} has {arm.n} joints"
                 )
         try:
-            self._core = _core.Pipeline(
+            self._core = CorePipeline(
                 arm.core, observer, payload, self.conditioner, self.load_config, wrench, contact
             )
         except ValueError as e:
@@ -280,10 +282,12 @@ class Pipeline:
             raise InputError(f"sample: {str(e).splitlines()[0]}") from None
         return Touch(
             t.time_ns,
-            t.q,
-            t.dq,
+            cast(Array, t.q),
+            cast(Array, t.dq),
             t.status,
-            ExternalTorque(t.external_torque, t.external_torque_std, t.external_status),
+            ExternalTorque(
+                cast(Array, t.external_torque), cast(Array, t.external_torque_std), t.external_status
+            ),
             Payload(
                 t.mass,
                 t.mass_std,
@@ -332,7 +336,7 @@ class Pipeline:
         )
 
     @property
-    def load(self) -> _core.Load:
+    def load(self) -> CoreLoad:
         """What is held, as a body for :class:`palpate.Controller`; zero unless the payload filter says ``ok``."""
         return self._core.load()
 
@@ -436,7 +440,7 @@ def tare(arm: Arm, log: Log, *, mass_std: float = 0.2) -> Tare:
     if log.n != arm.n:
         raise InputError(f"the log has {log.n} joints, arm {arm.name!r} has {arm.n}")
     try:
-        factors, std, used = _core.tare(
+        factors, std, used = core_tare(
             arm.core, mass_std, log.time_ns, log.position, log.velocity, log.effort
         )
     except ValueError as e:

@@ -18,8 +18,8 @@ from typing import Any, Protocol, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from .. import _core, robots
-from .._core import PayloadFilter, Status
+from .. import robots
+from .._core import PayloadFilter, PublishedKalman, PublishedKalmanFilter, Status
 from ..arm import Arm, Array
 from ..control import Controller, FeedforwardName, Quintic, Setpoint
 from ..drivers.mujoco import MujocoDriver
@@ -110,7 +110,7 @@ class PublishedLaw:
         self, arm: Arm, *, kp: Sequence[float] = KP, kd: Sequence[float] = KD, limit: float = LIMIT
     ) -> None:
         known = as_published(arm)
-        self._filter = _core.PublishedKalmanFilter(known.core, _core.PublishedKalman())
+        self._filter = PublishedKalmanFilter(known.core, PublishedKalman())
         self._controller = Controller(known, kp, kd, limit=limit, feedforward="reference_gravity")
         self._asked = np.zeros(arm.n)
         self._before: int | None = None
