@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +34,7 @@ from .arm import Arm, Array
 from .errors import ArmError, InputError, suggest
 from .logs import Log, Sample
 
-Observer = (
+Observer: TypeAlias = (
     InverseDynamicsObserver
     | ModelResidualObserver
     | SlidingModeObserver
@@ -43,7 +43,7 @@ Observer = (
     | DisturbanceKalman
     | ExtendedKalman
 )
-PayloadEstimator = JointFormula | Regression | PayloadFilter
+PayloadEstimator: TypeAlias = JointFormula | Regression | PayloadFilter
 
 OBSERVERS: Mapping[str, type[Any]] = {
     "inverse-dynamics": InverseDynamicsObserver,
