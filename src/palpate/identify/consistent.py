@@ -23,6 +23,8 @@ PRIOR = 1.0
 """gamma: a prior of this weight allows a link's mass a standard deviation of 50 % (D = 2 eps^2 for a scale 1+eps)"""
 BARRIER = 0.01
 """mu: weight of staying positive; biases a well-seen parameter by a hundredth of its standard deviation"""
+SETTLED = 1e-6
+"""Newton decrement to stop at: a millionth of the change of f that one standard deviation makes"""
 THINNEST = 0.03
 """smallest radius of gyration of a prior [m]: the shape of a link is not known to better"""
 
@@ -136,8 +138,6 @@ def consistent(
     guess = np.maximum(np.abs(x[positive]), 1e-6)
     x[positive] = guess
     slope = barrier / guess  # where the data say nothing the first guess stays
-    scale = np.concatenate([np.abs(prior).max(axis=1).repeat(10), np.ones(len(x) - 10 * n)])
-    scale[positive] = guess
     ridge = 1e-12 * np.diag(H).max() * np.eye(len(x))
 
     def value(at: Array) -> float:
@@ -171,7 +171,7 @@ def consistent(
         d = np.sqrt(np.diag(hessian))
         move = -np.linalg.solve(hessian / np.outer(d, d), gradient / d) / d
         decrement = float(-gradient @ move)
-        if decrement < 1e-9:
+        if decrement < SETTLED:
             break
         length = 1.0
         while length > 1e-12 and not (value(x + length * move) <= now - 1e-4 * length * decrement):

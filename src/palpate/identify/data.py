@@ -20,7 +20,7 @@ BAND_RATIO = 5.0
 """the parallel filter passes this many times the band of the motion"""
 KINEMATIC_RATIO = 4.0
 """the kinematics are filtered this many times higher, so that they pass what the parallel filter passes"""
-GRID_RATIO = 10.0
+GRID_RATIO = 5.0
 """samples of the inner grid per period of the kinematic cutoff"""
 ROWS_PER_CUTOFF = 4.0
 """rows kept per period of the parallel cutoff: twice what the band needs"""

@@ -139,6 +139,7 @@ def columns(
     segment: Segment,
     shape: FrictionShape,
     load_torque: Array | None,
+    sign: Array | None = None,
 ) -> Array:
     """Friction columns of every joint on the inner grid, (N, n, terms): torque per unit of each parameter.
 
@@ -147,8 +148,11 @@ def columns(
         segment: kinematics.
         shape: x_0 and v_s per joint.
         load_torque: (N, n) torque the gears transmit [N m]; needed with ``model.load``.
+        sign: (N, n) the remembered sign at the shape's distances, where it is known already.
     """
-    z = remembered_sign(segment.dq, 1.0 / segment.rate, np.array([shape.presliding]))[0]
+    z = sign
+    if z is None:
+        z = remembered_sign(segment.dq, 1.0 / segment.rate, np.array([shape.presliding]))[0]
     parts = [z, segment.dq, np.ones_like(z)]
     if model.stribeck:
         parts.append(z * np.exp(-np.square(segment.dq / np.array(shape.stribeck_velocity))))

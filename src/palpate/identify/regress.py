@@ -153,6 +153,7 @@ class Builder:
         self.data = data
         self.y = y
         self.links = transmitted is None
+        self._signs: dict[tuple[int, tuple[float, ...]], Array] = {}
         self.raw: dict[int, Array] = {}
         if transmitted is None:
             self.raw = {id(s): arm.regressor(s.q, s.dq, s.ddq) for s in data.segments}
@@ -181,6 +182,21 @@ class Builder:
             return self.transmitted[id(segment)]
         return self.raw[id(segment)] @ phi[: 10 * self.arm.n]
 
+    def signs(self, segment: Segment, model: FrictionModel) -> Array:
+        """Remembered signs at every distance the model tries, (K, N, n); computed once."""
+        key = (id(segment), model.presliding)
+        if key not in self._signs:
+            reach = np.array(model.presliding)
+            self._signs[key] = remembered_sign(segment.dq, 1.0 / segment.rate, reach)
+        return self._signs[key]
+
+    def _sign(self, segment: Segment, model: FrictionModel, shape: FrictionShape) -> Array | None:
+        """The remembered sign of the shape, (N, n), if its distances are among the model's."""
+        if not set(shape.presliding) <= set(model.presliding):
+            return None
+        pick = [model.presliding.index(x) for x in shape.presliding]
+        return self.signs(segment, model)[pick, :, np.arange(len(pick))].T
+
     def problem(self, model: FrictionModel, shape: FrictionShape, phi: Array | None = None) -> Problem:
         """The problem with this friction; phi gives the load torque where the model wants it."""
         n = self.arm.n
@@ -190,7 +206,7 @@ class Builder:
         def friction(s: Segment) -> Array:
             known = phi if phi is not None or self.links else np.zeros(0)
             torque = self.load_torque(s, known) if model.load and known is not None else None
-            return columns(model, s, shape, torque)
+            return columns(model, s, shape, torque, self._sign(s, model, shape))
 
         reduced = self.data.reduce(friction)
         couplings = [
@@ -221,7 +237,7 @@ class Builder:
         speeds = fastest(data)[:, None] * parts  # (n, V)
 
         def candidates(s: Segment) -> Array:
-            z = remembered_sign(s.dq, 1.0 / s.rate, reach).transpose(1, 2, 0)  # (N, n, K)
+            z = self.signs(s, model).transpose(1, 2, 0)  # (N, n, K)
             if not len(parts):
                 return z[..., None]
             bumps = np.exp(-np.square(s.dq[:, :, None] / speeds))  # (N, n, V)
