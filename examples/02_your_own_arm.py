@@ -3,7 +3,7 @@
 The URDF here is a two-joint arm written out below; take the path of yours instead. Needs palpate[card]. Prints:
 
     weigh by the elbow: 2.40 N m per kg at that pose
-    0.80 ± 0.03 kg, ok
+    0.80 ± 0.04 kg, ok
 """
 
 from __future__ import annotations

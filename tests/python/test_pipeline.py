@@ -27,6 +27,10 @@ PIPELINES = {
     "joint-formula on sliding-mode": lambda arm: pp.Pipeline(
         arm, observer=pp.SlidingModeObserver(cutoff=10.0), payload=pp.JointFormula(joint=5)
     ),
+    "payload-filter, momentum, wrench and contact": lambda arm: pp.Pipeline(
+        arm, observer=pp.MomentumObserver(), wrench=pp.WrenchEstimator(), contact=pp.ContactDetector()
+    ),
+    "disturbance-kalman": lambda arm: pp.Pipeline(arm, observer=pp.DisturbanceKalman(), payload=None),
     "super-twisting": lambda arm: pp.Pipeline(arm, observer=pp.MomentumSuperTwisting(), payload=None),
     "joint-formula on inverse-dynamics": lambda arm: pp.Pipeline(
         arm,

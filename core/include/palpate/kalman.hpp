@@ -101,7 +101,7 @@ class JointKalman {
     BaseFrame chain(arm, q_m, v, in.load);
     const JointVector bias = chain.inverse_dynamics(JointVector{});
     JointVector rest{};
-    if (in.load_rest.m != 0.0)
+    if (in.load_rest.m != 0.0 || in.load_rest.mc.x != 0.0 || in.load_rest.mc.y != 0.0 || in.load_rest.mc.z != 0.0)
       rest = chain.body_torque(n_ - 1, moved(chain.pose().R, chain.pose().p, in.load_rest));
     JointMatrix W = mass_matrix<double>(arm, q_m, in.load);
     JointVector r{}, slope{};

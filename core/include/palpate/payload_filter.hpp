@@ -26,11 +26,11 @@ struct PayloadFilterConfig {
 
 /// State (q, q', theta, b) with
 ///   M(q; theta) q'' + C q' + g + tau_f = tau + b,   z = q + encoder rounding
-/// theta = m, or (m, delta) with delta = c - grasp the offset of the load's centre of mass, in tip axes; b the slowly
+/// theta = m, or (m, m delta) with delta = c - grasp the offset of the load's centre of mass, in tip axes; b the slowly
 /// varying error of the friction model, one per joint that has Coulomb friction. (MATH.md section 4; kalman.hpp.)
 ///
-/// The load is a point mass at c. delta is a state rather than m delta because that is what is known beforehand: a hand
-/// grasps within some centimetres, whatever the object weighs.
+/// The torque is linear in m and m delta but for m |delta|^2. (In m and delta it is not: a load that hangs still says
+/// m delta = 0, from which a filter on delta would conclude that m is small.)
 /// b is a first-order process of standard deviation Friction::uncertainty (wide at rest, where stiction hides any torque
 /// within +-F_c) and time friction_time; a start, a stop and a reversal draw it anew.
 ///
@@ -49,7 +49,7 @@ class PayloadFilter {
         loads_(config.first_moment ? 4 : 1),
         biases_(has_coulomb(arm) ? arm.n() : 0),
         filter_(arm.n(), loads_, biases_ > 0, has_rounding(arm)),
-        tip_axis_{arm.R_last_tip().cx, arm.R_last_tip().cy, arm.R_last_tip().cz} {
+        unit_(detail::load_basis(arm)) {
     if (!arm.has_dynamics()) throw std::invalid_argument("PayloadFilter: the arm has no masses; give inertials");
     if (std::isnan(config.mass_prior_std)) config_.mass_prior_std = holdable_mass(arm);
     check::positive("PayloadFilterConfig mass_prior_std [kg]", config_.mass_prior_std);
@@ -108,7 +108,7 @@ class PayloadFilter {
   const Filter& filter() const noexcept { return filter_; }
 
   /// The load as a body on the last link, for the controller's feed-forward (never of negative mass).
-  Inertia<double> load() const noexcept { return about_origin(mass(), centre(), Sym3<double>{}); }
+  Inertia<double> load() const noexcept { return physical(load_of_state()); }
 
  private:
   static constexpr std::size_t u(int i) noexcept { return static_cast<std::size_t>(i); }
@@ -153,7 +153,8 @@ class PayloadFilter {
     set_offset_prior();
   }
   void set_offset_prior() noexcept {
-    for (int k = 1; k < loads_; ++k) filter_.set_parameter(k, 0.0, config_.offset_prior_std * config_.offset_prior_std);
+    const double moment = config_.offset_prior_std * config_.mass_prior_std;
+    for (int k = 1; k < loads_; ++k) filter_.set_parameter(k, 0.0, moment * moment);
   }
   /// After a gap: the mass may be another one.
   void forget_load() noexcept {
@@ -161,14 +162,19 @@ class PayloadFilter {
     set_offset_prior();
   }
 
-  /// c in the last body's axes [m].
-  Vec3<double> centre() const noexcept {
-    Vec3<double> c = arm_->p_last_grasp();
-    for (int k = 1; k < loads_; ++k) c = c + filter_.parameter(k) * tip_axis_[u(k - 1)];
-    return c;
+  Inertia<double> load_of_state() const noexcept {
+    Inertia<double> load{};
+    for (int k = 0; k < loads_; ++k) load = load + filter_.parameter(k) * unit_[u(k)];
+    return load;
   }
-  /// A negative mass has weight in the filter, so that its estimate stays unbiased near zero, but no inertia.
-  double mass() const noexcept { return std::max(filter_.parameter(0), 0.0); }
+  /// A body that can be: c no further from the grasp point than a hand could hold it.
+  Inertia<double> physical(const Inertia<double>& load) const noexcept {
+    if (!(load.m > 0.0)) return Inertia<double>{};
+    Vec3<double> moment = load.mc - load.m * arm_->p_last_grasp();
+    const double limit = std::max(0.3, 4.0 * config_.offset_prior_std) * load.m, length = std::sqrt(dot(moment, moment));
+    if (length > limit) moment = (limit / length) * moment;
+    return about_origin(load.m, arm_->p_last_grasp() + (1.0 / load.m) * moment, Sym3<double>{});
+  }
 
   double bias_variance(int i, double dq) const noexcept {
     const double std = filter_.expected_friction(*arm_, i).uncertainty(dq, config_.friction_fraction);
@@ -185,14 +191,13 @@ class PayloadFilter {
     JointVector variance = torque_variance_;
     for (int i = 0; i < arm_->n(); ++i) variance[u(i)] += model_error_[u(i)];
     add_curvature(variance);
-    const Vec3<double> c = centre();
-    const Inertia<double> unit = about_origin(1.0, c, Sym3<double>{}), missing = std::min(filter_.parameter(0), 0.0) * unit;
+    const Inertia<double> state = load_of_state(), real = physical(state);
+    // A negative mass has weight in the filter, so that its estimate stays unbiased near zero, but no inertia.
+    const Inertia<double> rest{state.m - real.m, state.mc - real.mc, Sym3<double>{}};
     const int last = arm_->n() - 1;
-    filter_.predict(*arm_, {s.tau, variance, load(), missing, decay_}, h, [&](const BaseFrame& chain, double* D, int stride) {
+    filter_.predict(*arm_, {s.tau, variance, real, rest, decay_}, h, [&](const BaseFrame& chain, double* D, int stride) {
       for (int p = 0; p < loads_; ++p) {
-        const Vec3<double>& axis = tip_axis_[u(p > 0 ? p - 1 : 0)];
-        const Inertia<double> slope = p == 0 ? unit : mass() * Inertia<double>{0.0, axis, parallel_axis(axis, c)};
-        const JointVector column = chain.body_torque(last, moved(chain.pose().R, chain.pose().p, slope));
+        const JointVector column = chain.body_torque(last, moved(chain.pose().R, chain.pose().p, unit_[u(p)]));
         for (int i = 0; i <= last; ++i) D[i * stride + p] = column[u(i)];
       }
     });
@@ -309,9 +314,8 @@ class PayloadFilter {
     out.mass = filter_.parameter(0);
     out.mass_std = mass_std();
     for (int k = 1; k < loads_; ++k) {
-      const double offset_variance = std::max(filter_.parameter_variance(k), 0.0), offset = filter_.parameter(k);
-      out.first_moment[u(k - 1)] = mass() * offset;
-      out.first_moment_std[u(k - 1)] = std::sqrt(mass() * mass() * offset_variance + offset * offset * out.mass_std * out.mass_std);
+      out.first_moment[u(k - 1)] = filter_.parameter(k);
+      out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0));
     }
     out.changes = changes_;
     out.change_time_ns = change_time_ns_;
@@ -325,7 +329,7 @@ class PayloadFilter {
   PayloadFilterConfig config_;
   int loads_, biases_;
   Filter filter_;
-  std::array<Vec3<double>, 3> tip_axis_;  // in the last body's axes
+  std::array<Inertia<double>, 4> unit_;
   static constexpr double least_model_error = 1e-6;  // [N^2 m^2]
   JointVector torque_variance_{}, surprise_{}, model_error_{};
   Filter::Parameters decay_{};

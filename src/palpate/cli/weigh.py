@@ -106,7 +106,7 @@ def run(
         typer.Option(
             metavar="NAME",
             help="Where the external torque comes from: extended-kalman, momentum, super-twisting, sliding-mode, "
-            "inverse-dynamics, model-residual or none. [default: extended-kalman]",
+            "disturbance-kalman, inverse-dynamics, model-residual or none. [default: extended-kalman]",
             show_default=False,
         ),
     ] = None,

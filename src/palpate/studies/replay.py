@@ -10,13 +10,13 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .._core import PayloadFilter
+from .._core import ContactDetector, MomentumObserver, PayloadFilter, WrenchEstimator
 from ..arm import Arm, Array
 from ..control import Quintic
 from ..drivers.mujoco import MujocoDriver
@@ -61,8 +61,10 @@ class Found(NamedTuple):
 
 
 def pipelines(arm: Arm) -> dict[str, Pipeline]:
-    """Every observer with every estimator, by name."""
+    """Every observer with every estimator, the force and contact estimators behind one, by name."""
+    touch = Pipeline(arm, observer=MomentumObserver(), wrench=WrenchEstimator(), contact=ContactDetector())
     made = {
+        "wrench and contact": touch,
         "payload-filter": Pipeline(arm, payload=PayloadFilter()),
         "payload-filter, first moment": Pipeline(arm),
     }
@@ -149,39 +151,33 @@ def _rebuilt(arm: Arm, pipeline: Pipeline) -> Pipeline:
 
 
 def _row(touch: Touch) -> Array:
-    """Everything in a Touch as 64-bit words, (k,)."""
-    return _words(touch, np.atleast_1d)[0]
+    """Everything in a Touch of one sample as 64-bit words, (k,)."""
+    return np.concatenate([_words(value).ravel() for value in _values(touch)])
 
 
 def _rows(touch: Touch) -> Array:
-    return _words(touch, np.asarray)
+    """Everything in a Touch of N samples as 64-bit words, (N, k)."""
+    rows = len(touch.time_ns)
+    return np.concatenate([_words(value).reshape(rows, -1) for value in _values(touch)], axis=1)
 
 
-def _words(touch: Touch, whole: Any) -> Array:
-    external, payload = touch.external, touch.payload
-    floats = (
-        touch.q,
-        touch.dq,
-        external.torque,
-        external.std,
-        payload.mass,
-        payload.mass_std,
-        payload.first_moment,
-    )
-    integers = (
-        touch.time_ns,
-        touch.status,
-        external.status,
-        payload.changes,
-        payload.change_time_ns,
-        payload.status,
-    )
-    rows = len(whole(touch.time_ns))
-    columns = [np.asarray(v, dtype=np.float64).reshape(rows, -1).view(np.int64) for v in floats]
-    columns += [
-        np.array([int(x) for x in whole(v).ravel()], dtype=np.int64).reshape(rows, -1) for v in integers
-    ]
-    return np.concatenate(columns, axis=1)
+def _values(record: Any) -> Iterator[Any]:
+    """All numbers of nested records, in the order of their fields; what was not asked for is left out."""
+    for field in fields(record):
+        value = getattr(record, field.name)
+        if is_dataclass(value):
+            yield from _values(value)
+        elif value is not None:
+            yield value
+
+
+def _words(value: Any) -> Array:
+    array = np.asarray(value)
+    if array.dtype == np.float64:
+        return np.ascontiguousarray(array).view(np.int64)
+    if array.dtype == object:  # a Status
+        return np.array(int(value))
+    return array.astype(np.int64)
 
 
 def _replayed(log: Log, pipeline: Pipeline) -> Array:

@@ -28,9 +28,7 @@ TWO_SIDED_95 = 1.959963984540054
 _HOPELESS = 2.0
 """an arm whose pose takes so many times its torque limit does not lift but is dragged along"""
 _KALMAN_LAG = 0.3
-"""time constant of the extended Kalman filter's external torque, for the regression behind it [s]"""
-_OTHER_LAG = 0.1
-"""the same of an observer that states no corner [s]"""
+"""of the extended Kalman filter's external torque, for the regression behind it; no pipeline knows it [s]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,11 +349,8 @@ def make_pipeline(
             f"estimator {estimator!r} weighs an external torque: choose an observer, one of {', '.join(OBSERVERS)}"
         )
     payload = ESTIMATORS[estimator]()
-    if estimator == "regression":
-        options = chosen.options()
-        corner = options.get("bandwidth") or options.get("cutoff")
-        lag = 1.0 / corner if corner else _KALMAN_LAG if isinstance(chosen, ExtendedKalman) else _OTHER_LAG
-        payload = ESTIMATORS[estimator](lag=lag)
+    if estimator == "regression" and isinstance(chosen, ExtendedKalman):
+        payload = ESTIMATORS[estimator](lag=_KALMAN_LAG)
     return Pipeline(arm, observer=chosen, payload=payload), tuple(remarks)
 
 
