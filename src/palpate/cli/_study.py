@@ -22,11 +22,23 @@ Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder for NAME.html, NA
 Quick = Annotated[
     bool, typer.Option("--quick", help="Few repetitions, to see that it works; no row is judged.")
 ]
+Page = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Also keep the tables in this Markdown page, one section per study."),
+]
 List = Annotated[bool, typer.Option("--list", help="Name the studies and stop.")]
 
 
 def run(
-    verb: str, names: list[str] | None, *, out: Path, quick: bool, listing: bool, json: bool, quiet: bool
+    verb: str,
+    names: list[str] | None,
+    *,
+    out: Path,
+    page: Path | None,
+    quick: bool,
+    listing: bool,
+    json: bool,
+    quiet: bool,
 ) -> int:
     """Run the studies of a verb; 1 if a row misses."""
     from ..studies import STUDIES
@@ -51,6 +63,12 @@ def run(
         chosen.append(known[name])
     make_folder(out)
     results = [(study, *_measure(study, out, quick=quick, silent=json or quiet)) for study in chosen]
+    if page is not None:
+        from ..report import markdown_table, update_markdown
+
+        for study, result, _ in results:
+            head = f"## {study.title}\n\nMeasured by `palpate {verb} {study.name}{' --quick' if quick else ''}`.\n\n"
+            update_markdown(page, study.name, head + markdown_table(result.rows))
     ok = all(result.ok for _, result, _ in results)
     if json:
         emit({"ok": ok, "quick": quick, "studies": [_plain(result, files) for _, result, files in results]})

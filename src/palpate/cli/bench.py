@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from ._common import Json, Quiet, examples
-from ._study import List, Names, Out, Quick
+from ._study import List, Names, Out, Page, Quick
 from ._study import run as run_studies
 
 
@@ -24,10 +24,13 @@ def add(app: typer.Typer) -> None:
 def run(
     names: Names = None,
     out: Out = Path("results"),
+    page: Page = None,
     quick: Quick = False,
     listing: List = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Bench."""
-    return run_studies("bench", names, out=out, quick=quick, listing=listing, json=json, quiet=quiet)
+    return run_studies(
+        "bench", names, out=out, page=page, quick=quick, listing=listing, json=json, quiet=quiet
+    )

@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from ._common import Json, Quiet, examples
-from ._study import List, Names, Out, Quick
+from ._study import List, Names, Out, Page, Quick
 from ._study import run as run_studies
 
 
@@ -28,10 +28,13 @@ def add(app: typer.Typer) -> None:
 def run(
     names: Names = None,
     out: Out = Path("results"),
+    page: Page = None,
     quick: Quick = False,
     listing: List = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Reproduce."""
-    return run_studies("reproduce", names, out=out, quick=quick, listing=listing, json=json, quiet=quiet)
+    return run_studies(
+        "reproduce", names, out=out, page=page, quick=quick, listing=listing, json=json, quiet=quiet
+    )
