@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 import pickle
 
 import numpy as np
 import pytest
 
-from palpate import Pipeline, Quintic, Setpoint, robots
+from palpate import PalpateError, Pipeline, Quintic, Setpoint, robots
 from palpate.pipeline import ESTIMATORS, OBSERVERS
 from palpate.report import write_study
 from palpate.simulate import Attach, Load, Plant, Schedule
@@ -119,14 +120,6 @@ def test_rms_and_the_last_seconds():
     assert _bench.late_percent(time, np.full(len(time), 0.01 * MASS)) == pytest.approx(1.0)
 
 
-def double(job):
-    return 2 * job
-
-
-def fail(job):
-    raise ValueError(f"job {job}")
-
-
 @pytest.mark.parametrize("count", [1, 7])
 def test_work_keeps_the_order_and_tells_how_far(count):
     words = []
@@ -140,6 +133,11 @@ def test_work_keeps_the_order_and_tells_how_far(count):
 def test_work_passes_errors_on():
     with pytest.raises(ZeroDivisionError), Work(lambda *word: None, 3) as work:
         work.map(divide, [1, 0, 2])
+
+
+def test_work_says_when_a_process_was_killed():
+    with pytest.raises(PalpateError, match="killed from outside"), Work(lambda *word: None, 3) as work:
+        work.map(os._exit, [1, 1, 1])
 
 
 divide = (1).__truediv__  # bound methods of numbers travel to other processes

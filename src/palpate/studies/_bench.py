@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
 from types import MappingProxyType, TracebackType
@@ -23,6 +24,7 @@ from .._core import PayloadFilter, PublishedKalman, PublishedKalmanFilter, Statu
 from ..arm import Arm, Array
 from ..control import Controller, FeedforwardName, Quintic, Setpoint
 from ..drivers.mujoco import MujocoDriver
+from ..errors import PalpateError
 from ..logs import Log, Sample
 from ..pipeline import Payload, Pipeline, Touch
 from ..simulate import Load, Schedule, SensorModel
@@ -315,6 +317,7 @@ class Work:
 
         Raises:
             Exception: the first that a job raised; the jobs that have not begun are dropped.
+            PalpateError: something killed one of the processes.
         """
         if self._pool is None:
             results = []
@@ -322,10 +325,15 @@ class Work:
                 results.append(function(job))
                 self._tick()
             return results
-        futures: list[Future[Out]] = [self._pool.submit(function, job) for job in jobs]
-        for future in as_completed(futures):
-            future.result()
-            self._tick()
+        try:
+            futures: list[Future[Out]] = [self._pool.submit(function, job) for job in jobs]
+            for future in as_completed(futures):
+                future.result()
+                self._tick()
+        except BrokenProcessPool:
+            raise PalpateError(
+                "a process of this study was killed from outside, perhaps for want of memory; run it again"
+            ) from None
         return [future.result() for future in futures]
 
     def _tick(self) -> None:
