@@ -114,7 +114,7 @@ def _same(a: Any, b: Any) -> bool:
 class Friction:
     """Joint friction, link side, as torque that must be overcome (MATH.md section 6).
 
-    tau_f = (F_c + (F_s - F_c) exp(-(dq/v_s)^2)) s(dq) + F_v dq + F_o with F_c = coulomb + load |tau_load| and
+    tau_f = (F_c + (F_s - F_c) exp(-(dq/v_s)^2)) s(dq) + F_v dq + F_o with F_c = coulomb + load abs(tau_load) and
     s(dq) = tanh(dq / sign_velocity). For a prismatic joint read N for N m and m for rad.
     """
 

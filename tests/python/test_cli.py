@@ -122,6 +122,14 @@ def test_weigh_at_the_edges(options: tuple, status: str, words: str, palpate) ->
     assert words in done.out
 
 
+def test_weigh_draws_one_picture(palpate, tmp_path: Path) -> None:
+    done = palpate(*"weigh --duration 1 --no-record --no-report --picture lift.png --json".split())
+    assert done.json["files"] == {"picture": "lift.png"}
+    assert (tmp_path / "lift.png").read_bytes().startswith(b"\x89PNG")
+    done = palpate("weigh", "log.csv", "--picture", "lift.png")
+    assert done.code == 2 and "--picture is for a simulation" in done.err
+
+
 def test_weigh_a_log(palpate, recording: Path, tmp_path: Path) -> None:
     done = palpate("weigh", recording)
     assert done.code == 0 and done.err == ""

@@ -22,6 +22,7 @@ from ._common import (
     console,
     emit,
     examples,
+    is_png,
     is_recording,
     is_report,
     make_folder,
@@ -52,6 +53,7 @@ def add(app: typer.Typer) -> None:
             "palpate weigh",
             "palpate weigh --mass 0.4 --pose StandBy --seed 7",
             "palpate weigh --arm kuka_lbr_iiwa7 --out /tmp/iiwa --json",
+            "palpate weigh --duration 6 --picture weigh.png",
             "palpate weigh task.mcap --arm robot.arm.yaml",
             "palpate weigh log.csv --columns columns.yaml --arm robot.urdf --tip tool0 --effort torque",
         ),
@@ -133,6 +135,14 @@ def run(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files.")] = Path(),
     record: Annotated[bool, typer.Option("--record/--no-record", help="Write run.mcap.")] = True,
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PNG",
+            help="Also write one picture of the simulated arm and the mass it finds, for a slide.",
+            show_default=False,
+        ),
+    ] = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
@@ -140,7 +150,7 @@ def run(
     from .. import weigh as weighing
 
     if log is not None:
-        given = {"--mass": mass, "--pose": pose, "--start": start, "--speed": speed}
+        given = {"--mass": mass, "--pose": pose, "--start": start, "--speed": speed, "--picture": picture}
         _only("a simulation", "LOG is a recording", given)
     else:
         _only("a LOG", "nothing is recorded yet", {"--columns": columns, "--effort": effort})
@@ -148,8 +158,10 @@ def run(
     if report:
         make_folder(out)
         check_target(page, is_report, "the report")
+    if picture is not None:
+        check_target(picture, is_png, "the picture")
     files: dict[str, str] = {}
-    picture = None
+    scene_png = None
     live = not (json or quiet) and console().is_terminal
 
     if log is not None:
@@ -177,19 +189,27 @@ def run(
         if record:
             target = make_folder(out) / "run.mcap"
             check_target(target, is_recording, "the recording")
-        session = _session(task, pipeline, target, live=live, pose=name, picture=report)
+        session = _session(
+            task, pipeline, target, live=live, pose=name, picture=report or picture is not None
+        )
         result = weighing.weigh_session(session, pose=name)
         if target is not None:
             files["log"] = str(target)
         if session.picture is not None:
-            picture = picture_png(session.picture)
+            scene_png = picture_png(session.picture)
+        elif picture is not None:
+            raise InputError(f"{picture} cannot be drawn: {session.picture_error or 'the run was stopped'}")
         elif session.picture_error and not (json or quiet):
             say(f"no picture: {session.picture_error}")
         title = f"{scene.arm.name} weighs {held:g} kg"
-    if report:
-        from ..report import write_weigh_report
+    if report or picture is not None:
+        from ..report import hero_picture, write_weigh_report
 
-        files["report"] = str(write_weigh_report(result.report(title=title, picture=picture), page))
+        told = result.report(title=title, picture=scene_png)
+        if report:
+            files["report"] = str(write_weigh_report(told, page))
+        if picture is not None:
+            files["picture"] = str(hero_picture(told, picture))
     if json:
         emit({**result.summary(), "files": files})
     elif quiet:

@@ -282,8 +282,9 @@ def _others(weighing: Weighing) -> dict[str, Array]:
         observer=OBSERVERS["sliding-mode"](friction=False),
         payload=ESTIMATORS["joint-formula"](joint=5, lever=0.21, gravity=9.81),
     ).run(weighing.log)
-    usable = np.isin(published.payload.status, [int(Status.ok), int(Status.saturated)])
-    return {"published: sliding mode, joint formula": np.where(usable, published.payload.mass, np.nan)}
+    # As published it has no status: what it tells while it settles is shown too.
+    told = np.isin(published.payload.status, [int(Status.ok), int(Status.saturated), int(Status.warming)])
+    return {"published: sliding mode, joint formula": np.where(told, published.payload.mass, np.nan)}
 
 
 def make_pipeline(
