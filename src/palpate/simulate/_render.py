@@ -19,8 +19,8 @@ from . import _model
 class Camera:
     """Where a picture is taken from. Angles are of the line of sight; up is up, whatever the arm's mount."""
 
-    azimuth: float = 135.0
-    """about the vertical [deg]"""
+    azimuth: float | None = 135.0
+    """about the vertical [deg]; None: across the plane the arm reaches in as it stands, a little from ahead"""
     elevation: float = -18.0
     """< 0 looks down [deg]"""
     distance: float | None = None
@@ -72,11 +72,12 @@ class Studio:
         else:
             view = mj.MjvCamera()
             view.type = mj.mjtCamera.mjCAMERA_FREE
-            view.azimuth, view.elevation = camera.azimuth, camera.elevation
+            arm = [i for i in range(self._model.nbody) if self._model.body(i).name.startswith("arm:")]
+            points = data.xpos[arm]
+            view.azimuth = _across(points) if camera.azimuth is None else camera.azimuth
+            view.elevation = camera.elevation
             view.distance = 1.3 * extent if camera.distance is None else camera.distance
             if camera.lookat is None:
-                arm = [i for i in range(self._model.nbody) if self._model.body(i).name.startswith("arm:")]
-                points = data.xpos[arm]
                 view.lookat[:] = 0.5 * (points.min(axis=0) + points.max(axis=0))
             else:
                 view.lookat[:] = R_world_base @ np.asarray(camera.lookat)
@@ -89,3 +90,11 @@ class Studio:
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
+
+
+def _across(points: Array) -> float:
+    """Azimuth [deg] that sees a chain of points, world frame (n, 3), from the side; the default if upright."""
+    x, y = points[-1, :2] - points[0, :2]
+    if np.hypot(x, y) < 0.1 * np.linalg.norm(np.ptp(points, axis=0)):
+        return 135.0
+    return float(np.degrees(np.arctan2(y, x))) + 110.0

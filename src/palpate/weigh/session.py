@@ -395,12 +395,12 @@ def run(
             if recorder is not None and interrupted and last_ns is not None:
                 recorder.event(last_ns, "stop", "stopped before its end, by request")
             if picture:
+                from ..simulate import Camera
+
                 try:
-                    drawn = driver.plant.render()
-                except (
-                    PalpateError
-                ) as e:  # a weighing without a picture is one all the same; the caller tells why
-                    error = str(e)
+                    drawn = driver.plant.render(camera=Camera(azimuth=None, elevation=-20.0))
+                except PalpateError as e:
+                    error = str(e)  # a weighing without a picture is one all the same; the caller tells why
     finally:
         if recorder is not None:
             recorder.close()
