@@ -482,7 +482,7 @@ def test_lara8():
     assert np.linalg.norm(force, axis=1).mean() == pytest.approx(51.62, abs=0.05)
     assert (log.effort - log.model_torque)[:, 1].mean() == pytest.approx(-36.16, abs=0.05)
     assert log.signals["pose"].value.shape == (1247, 7)
-    with pytest.raises(LogError, match="named.'lara8'. fits"):
+    with pytest.raises(LogError, match="--columns lara8"):
         Log.open(folder / "jogging_final.csv")
 
 

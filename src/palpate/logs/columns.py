@@ -340,10 +340,14 @@ def conventional(header: Sequence[str] | None, where: str) -> ColumnMap:
     time = next((t for t in ("time_ns", "time_s") if t in names), None)
     if time is None or "position_1" not in names:
         fitting = [name for name, known in _NAMED.items() if header is not None and _fits(known, header)]
-        hint = f"; ColumnMap.named({fitting[0]!r}) fits" if fitting else ""
+        hint = (
+            f"; this is a {fitting[0]} table: ColumnMap.named({fitting[0]!r}), --columns {fitting[0]}"
+            if fitting
+            else ""
+        )
         there = _some(list(header)) if header else "no header"
         raise LogError(
-            f"{where}: without columns=ColumnMap(...) a table must have the columns time_ns (or time_s), "
+            f"{where}: without a column map a table must have the columns time_ns (or time_s), "
             f"position_1, ... and effort_1, ...; there is {there}{hint}"
         )
     optional: dict[str, Any] = {
