@@ -280,7 +280,7 @@ void bind_pipeline(nb::module_& m) {
                                 {{"first_moment", &RegressionConfig::first_moment, "estimate m and m (c - grasp)"},
                                  {"mass_prior_std", &RegressionConfig::mass_prior_std, "[kg]"},
                                  {"offset_prior_std", &RegressionConfig::offset_prior_std, "of the grasp point [m]"},
-                                 {"lag", &RegressionConfig::lag, "time constant of the observer before it, NaN: as the pipeline knows it [s]"},
+                                 {"lag", &RegressionConfig::lag, "lag of the observer before it, NaN: as that observer knows it [s]"},
                                  {"acceleration_time", &RegressionConfig::acceleration_time, "time constant of the acceleration [s]"},
                                  {"friction_fraction", &RegressionConfig::friction_fraction, "friction model's error in motion, part of Coulomb friction [1]"},
                                  {"bias_time", &RegressionConfig::bias_time, "how long an error of friction or gain lasts [s]"},

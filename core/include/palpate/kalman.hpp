@@ -1,5 +1,6 @@
 // The Kalman filter that the extended Kalman observer and the payload filter share.
 #pragma once
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdint>
@@ -107,7 +108,8 @@ class JointKalman {
     JointVector r{}, slope{};
     for (int i = 0; i < n_; ++i) {
       const Friction friction = expected_friction(arm, i);
-      slope[u(i)] = friction.derivative(v[u(i)]);
+      // Friction that falls with speed (Stribeck) keeps its value over the step: extrapolated, a light joint would run away.
+      slope[u(i)] = std::max(friction.derivative(v[u(i)]), 0.0);
       const double x = h * slope[u(i)] / W(i, i);
       theta_[u(i)] = weight(x);
       r[u(i)] = h * (in.tau[u(i)] - friction.torque(v[u(i)]) - bias[u(i)] - rest[u(i)]);

@@ -18,23 +18,40 @@ inline std::array<Inertia<double>, 4> load_basis(const Arm& arm) noexcept {
           Inertia<double>{0.0, R.cy, parallel_axis(R.cy, c)}, Inertia<double>{0.0, R.cz, parallel_axis(R.cz, c)}};
 }
 
-/// Forward, at rest or backward, per joint, with hysteresis: while it stays, so does the error of the friction model.
+/// Forward, at rest or backward, per joint: while it stays, so does the error of the friction model.
+/// A joint rests as soon as it is slow, and until it has left that place: what holds it there is one torque, however often a noisy
+/// velocity, or trembling on the spot, crosses zero.
 class Regime {
  public:
-  /// True if joint j has started, stopped or reversed.
-  bool changed(const Arm& arm, int j, double dq) noexcept {
+  /// True if joint j has started, stopped or reversed. q, dq [rad, rad/s].
+  bool changed(const Arm& arm, int j, double q, double dq) noexcept {
     const double v0 = arm.joint(j).friction.sign_velocity;
-    int& now = regime_[at(j)];
-    const double threshold = now == 0 ? 1.25 * v0 : 0.75 * v0;
-    const int next = dq > threshold ? 1 : dq < -threshold ? -1 : 0;
-    const bool changed = next != now;
-    now = next;
-    return changed;
+    Joint& joint = joints_[at(j)];
+    if (!joint.known) {
+      joint.known = true;
+      joint.stopped_at = q;
+    }
+    if (joint.direction == 0) {
+      const double away = q - joint.stopped_at;
+      if (std::abs(away) < presliding + 4.0 * std::sqrt(arm.position_variance(j)) || std::abs(dq) < 1.25 * v0) return false;
+      joint.direction = dq > 0.0 ? 1 : -1;
+      return true;
+    }
+    if (joint.direction * dq > 0.75 * v0) return false;
+    joint.direction = 0;
+    joint.stopped_at = q;
+    return true;
   }
-  bool at_rest(int j) const noexcept { return regime_[at(j)] == 0; }
+  bool at_rest(int j) const noexcept { return joints_[at(j)].direction == 0; }
 
  private:
-  std::array<int, max_joints> regime_{};
+  static constexpr double presliding = 5e-3;  // [rad]
+  struct Joint {
+    bool known = false;
+    int direction = 0;
+    double stopped_at = 0.0;  // [rad]
+  };
+  std::array<Joint, max_joints> joints_{};
 };
 
 }  // namespace detail
@@ -113,7 +130,7 @@ struct RegressionConfig {
   bool first_moment = false;        ///< estimate m and m (c - grasp); else m alone, held exactly at the grasp point
   double mass_prior_std = 20.0;     ///< of the mass before anything is known, about 0 [kg]
   double offset_prior_std = 0.05;   ///< of the grasp point's error, each tip axis [m]
-  double lag = std::numeric_limits<double>::quiet_NaN();  ///< of the observer before this, applied to the regressor too [s]; NaN: as Pipeline knows it
+  double lag = std::numeric_limits<double>::quiet_NaN();  ///< of the observer before this, applied to the regressor too [s]; NaN: as the observer knows it
   double acceleration_time = 0.05;  ///< time constant of the acceleration in the regressor [s]
   double friction_fraction = 0.3;   ///< error of the friction model in motion, part of Coulomb friction [1]
   double bias_time = 5.0;           ///< how long an error of friction or drive gain stays the same [s]
@@ -134,8 +151,7 @@ class Regression {
   explicit Regression(const Arm& arm, const RegressionConfig& config = {}) : arm_(&arm), config_(config), loads_(config.first_moment ? 4 : 1), unit_(detail::load_basis(arm)) {
     check::positive("RegressionConfig mass_prior_std [kg]", config.mass_prior_std);
     check::positive("RegressionConfig offset_prior_std [m]", config.offset_prior_std);
-    if (std::isnan(config_.lag)) config_.lag = 0.0;
-    check::not_negative("RegressionConfig lag [s]", config_.lag);
+    if (!std::isnan(config.lag)) check::not_negative("RegressionConfig lag [s]", config.lag);
     check::not_negative("RegressionConfig acceleration_time [s]", config.acceleration_time);
     check::not_negative("RegressionConfig friction_fraction [1]", config.friction_fraction);
     check::positive("RegressionConfig bias_time [s]", config.bias_time);
@@ -148,8 +164,9 @@ class Regression {
     }
   }
 
-  /// The sample and the external torque an observer made of it.
-  Payload step(const JointSample& s, const ExternalTorque& external) noexcept {
+  /// The sample, the external torque an observer made of it, and how late that is [s]; the configuration's lag has precedence.
+  Payload step(const JointSample& s, const ExternalTorque& external, double lag = 0.0) noexcept {
+    lag_ = std::isnan(config_.lag) ? lag : config_.lag;
     const bool continues = started_ && s.dt > 0.0 && s.status != Status::gap;
     if (s.status == Status::ok) {
       update_regressor(s, continues ? s.dt : 0.0);
@@ -158,10 +175,10 @@ class Regression {
     }
     const bool usable = s.status == Status::ok && (external.status == Status::ok || external.status == Status::saturated);
     if (!usable) return report(s.status == Status::ok ? external.status : s.status);
-    const double correlated = s.dt > 0.0 ? std::max(1.0, 2.0 * config_.lag / s.dt) : 1.0;
+    const double correlated = s.dt > 0.0 ? std::max(1.0, 2.0 * lag_ / s.dt) : 1.0;
     for (int j = 0; j < arm_->n(); ++j) {
       const auto u = detail::at(j);
-      if (since_change_[u] < std::max(5.0 * config_.lag, config_.settling_time)) continue;  // the residual still holds what was before
+      if (since_change_[u] < std::max(5.0 * lag_, config_.settling_time)) continue;  // the residual still holds what was before
       measure(j, external.torque[u], correlated * external.noise[u] * external.noise[u] + 1e-12);
     }
     return report(external.status);
@@ -185,7 +202,7 @@ class Regression {
     dq_ = s.dq;
     BaseFrame chain(*arm_, s.q, s.dq);
     chain.inverse_dynamics(without_noise(s, dt));
-    const double b = dt > 0.0 && config_.lag > 0.0 ? -std::expm1(-dt / config_.lag) : 1.0;
+    const double b = dt > 0.0 && lag_ > 0.0 ? -std::expm1(-dt / lag_) : 1.0;
     for (int k = 0; k < loads_; ++k) {
       const JointVector column = chain.body_torque(arm_->n() - 1, moved(chain.pose().R, chain.pose().p, unit_[u(k)]));
       for (int j = 0; j < arm_->n(); ++j) H_[u(k)][u(j)] += b * (-column[u(j)] - H_[u(k)][u(j)]);
@@ -211,7 +228,7 @@ class Regression {
     for (int j = 0; j < arm_->n(); ++j) {
       slow_dq_[u(j)] = started_ ? slow_dq_[u(j)] + smoothing * (s.dq[u(j)] - slow_dq_[u(j)]) : s.dq[u(j)];
       const JointDescription& d = arm_->joint(j);
-      const bool changed = regime_.changed(*arm_, j, slow_dq_[u(j)]);
+      const bool changed = regime_.changed(*arm_, j, s.q[u(j)], slow_dq_[u(j)]);
       const double rest = d.friction.uncertainty(regime_.at_rest(j) ? 0.0 : 1e3 * d.friction.sign_velocity, config_.friction_fraction);
       const double gain = d.torque_gain_std * s.tau[u(j)];
       const double variance = rest * rest + gain * gain;
@@ -262,6 +279,7 @@ class Regression {
   const Arm* arm_;
   RegressionConfig config_;
   int loads_;
+  double lag_ = 0.0;  // [s]
   std::array<Inertia<double>, 4> unit_;
   std::array<JointVector, 4> H_{};  // d tau_ext / d theta
   JointVector dq_{}, ddq_{}, slow_dq_{};

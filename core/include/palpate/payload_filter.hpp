@@ -36,7 +36,8 @@ struct PayloadFilterConfig {
 ///
 /// Grasp and release: twelve hypotheses "the mass jumped s seconds ago" run beside the filter (Willsky, Jones 1976). Each
 /// propagates the error e that a unit jump would leave and correlates it with the innovations y of variance S:
-///   jump = sum(e y/S) / sum(e^2/S),   significance = |sum(e y/S)| / sqrt(sum(e^2/S))  [standard deviations].
+///   jump = sum(e y/S) / I,   significance = |sum(e y/S)| / sqrt(I)  [standard deviations],   I = sum(e^2/S) + 1/mass_prior_std^2.
+/// The prior keeps a joint that hardly feels the load from explaining its own breakaway by a load that no arm could hold.
 /// The winner's e, times the prior, is added to the covariance, so that the new load is learnt as the first one was.
 class PayloadFilter {
  public:
@@ -48,11 +49,11 @@ class PayloadFilter {
         config_(config),
         loads_(config.first_moment ? 4 : 1),
         biases_(has_coulomb(arm) ? arm.n() : 0),
+        initial_prior_std_(std::isnan(config.mass_prior_std) ? holdable_mass(arm) : config.mass_prior_std),
         filter_(arm.n(), loads_, biases_ > 0, has_rounding(arm)),
         unit_(detail::load_basis(arm)) {
     if (!arm.has_dynamics()) throw std::invalid_argument("PayloadFilter: the arm has no masses; give inertials");
-    if (std::isnan(config.mass_prior_std)) config_.mass_prior_std = holdable_mass(arm);
-    check::positive("PayloadFilterConfig mass_prior_std [kg]", config_.mass_prior_std);
+    check::positive("PayloadFilterConfig mass_prior_std [kg]", initial_prior_std_);
     check::positive("PayloadFilterConfig offset_prior_std [m]", config.offset_prior_std);
     check::positive("PayloadFilterConfig velocity_prior_std [rad/s]", config.velocity_prior_std);
     check::not_negative("PayloadFilterConfig model_torque_std [N m]", config.model_torque_std);
@@ -66,9 +67,7 @@ class PayloadFilter {
     for (int i = 0; i < arm.n(); ++i)
       torque_variance_[u(i)] = arm.torque_variance(i) + config.model_torque_std * config.model_torque_std;
     decay_.fill(1.0);
-    surprise_.fill(1.0);
-    model_error_.fill(least_model_error);
-    set_load_prior();
+    forget_everything();
     restart_hypotheses();
   }
 
@@ -92,11 +91,23 @@ class PayloadFilter {
       }
     });
     if (!filter_.healthy()) {  // start over rather than report what came out of it
-      set_load_prior();
+      forget_everything();
       begin(s);
       return report(s, Status::warming);
     }
     learn_model_error(s.dt);
+    unexplained_time_ = explained() ? 0.0 : unexplained_time_ + s.dt;
+    // Lost: it explains nothing, or by a load that weighs less than nothing.
+    if (unexplained_time_ > 1.0 || filter_.parameter(0) < -2.0 * initial_prior_std_) {
+      forget_everything();
+      begin(s);
+      return report(s, Status::warming);
+    }
+    if (filter_.parameter(0) > 2.0 * mass_prior_std_) {  // the prior was too narrow, and has held the estimate back
+      mass_prior_std_ = 2.0 * filter_.parameter(0);
+      forget_load();
+      restart_hypotheses();
+    }
     look_for_change(s);
     return report(s, Status::ok);
   }
@@ -144,21 +155,26 @@ class PayloadFilter {
 
   void begin(const JointSample& s) noexcept {
     filter_.start(*arm_, s, config_.velocity_prior_std);
-    for (int i = 0; i < biases_; ++i) redraw_bias(i, bias_variance(i, filter_.dq(i)));
+    regime_ = {};
+    for (int i = 0; i < biases_; ++i) redraw_bias(i);
     started_ = true;
     restart_hypotheses();
   }
-  void set_load_prior() noexcept {
-    filter_.set_parameter(0, 0.0, config_.mass_prior_std * config_.mass_prior_std);
+  void forget_everything() noexcept {
+    surprise_.fill(1.0);
+    unexplained_variance_ = unexplained_time_ = 0.0;
+    mass_prior_std_ = initial_prior_std_;
+    model_error_.fill(least_model_error);
+    filter_.set_parameter(0, 0.0, mass_prior_std_ * mass_prior_std_);
     set_offset_prior();
   }
   void set_offset_prior() noexcept {
-    const double moment = config_.offset_prior_std * config_.mass_prior_std;
+    const double moment = config_.offset_prior_std * mass_prior_std_;
     for (int k = 1; k < loads_; ++k) filter_.set_parameter(k, 0.0, moment * moment);
   }
-  /// After a gap: the mass may be another one.
+  /// The mass may be another one.
   void forget_load() noexcept {
-    filter_.set_parameter(0, filter_.parameter(0), config_.mass_prior_std * config_.mass_prior_std);
+    filter_.set_parameter(0, filter_.parameter(0), mass_prior_std_ * mass_prior_std_);
     set_offset_prior();
   }
 
@@ -176,16 +192,16 @@ class PayloadFilter {
     return about_origin(load.m, arm_->p_last_grasp() + (1.0 / load.m) * moment, Sym3<double>{});
   }
 
-  double bias_variance(int i, double dq) const noexcept {
+  double bias_variance(int i) const noexcept {
+    const double dq = regime_.at_rest(i) ? 0.0 : filter_.dq(i);
     const double std = filter_.expected_friction(*arm_, i).uncertainty(dq, config_.friction_fraction);
     return std * std;
   }
-  void redraw_bias(int i, double variance) noexcept { filter_.set_parameter(loads_ + i, 0.0, variance); }
+  void redraw_bias(int i) noexcept { filter_.set_parameter(loads_ + i, 0.0, bias_variance(i)); }
   void predict(const JointSample& s, double h) noexcept {
     const double phi = std::exp(-h / config_.friction_time);
     for (int i = 0; i < biases_; ++i) {
-      const double dq = filter_.dq(i), variance = bias_variance(i, dq);
-      if (regime_.changed(*arm_, i, dq)) redraw_bias(i, variance);
+      if (regime_.changed(*arm_, i, filter_.q(i), filter_.dq(i))) redraw_bias(i);
       decay_[u(loads_ + i)] = phi;
     }
     JointVector variance = torque_variance_;
@@ -202,7 +218,7 @@ class PayloadFilter {
       }
     });
     for (int i = 0; i < biases_; ++i)
-      filter_.add_parameter_variance(loads_ + i, (1.0 - phi * phi) * bias_variance(i, filter_.dq(i)));
+      filter_.add_parameter_variance(loads_ + i, (1.0 - phi * phi) * bias_variance(i));
     for (Hypothesis& hyp : hypotheses_) {
       filter_.propagate(hyp.e);
       hyp.age += h;
@@ -210,13 +226,18 @@ class PayloadFilter {
   }
 
   /// An arm whose model is wrong surprises its filter: the innovations' y^2/S, 1 on average, stays above it. A torque
-  /// variance per joint then grows until they fit, fast, and shrinks again, slowly: the interval tells of the error.
+  /// variance per joint then grows until they fit, fast, and shrinks again, slowly. The filter takes it for white; but it may
+  /// as well stay, so that no averaging removes it: the interval that is reported counts it once more, as a constant torque.
   void learn_model_error(double dt) noexcept {
     for (int i = 0; i < arm_->n(); ++i) {
       const double excess = surprise_[u(i)] - 1.3;
       const double rate = excess > 0.0 ? std::min(excess, 3.0) / 0.02 : std::max(excess, -1.0) / 1.0;
       model_error_[u(i)] = std::clamp(model_error_[u(i)] * std::exp(std::min(rate * dt, 2.0)), least_model_error, 1e6);
     }
+  }
+  /// Whether the state explains what every joint does now.
+  bool explained() const noexcept {
+    return std::all_of(surprise_.begin(), surprise_.begin() + arm_->n(), [](double s) { return s < 2.0; });
   }
   /// Mean surprise of the joints, at least 1.
   double surprise() const noexcept {
@@ -230,7 +251,7 @@ class PayloadFilter {
   /// filter that starts hanging, where the lever is zero, believes in masses it has read from its own noise.
   /// Inertia: q'' is not linear in m where the load may outweigh the links, so (std(m) J_i.(a_c - g))^2 times
   /// (std(m) J_i.J_i / W_ii)^2, at most 1. Without it the first samples of a light arm are taken for a weighing.
-  void add_curvature(JointVector& variance) const noexcept {
+  void add_curvature(JointVector& variance) noexcept {
     const Pose<double> P = forward_kinematics<double>(*arm_, filter_.positions());
     const Vec3<double> c = P.p + P.R * arm_->p_last_grasp(), g = arm_->gravity();
     const double mass_variance = filter_.parameter_variance(0);
@@ -246,10 +267,13 @@ class PayloadFilter {
         if (i != j) variance[u(j)] += mass_variance * slope * slope * arm_->position_variance(i);
       }
     }
+    double information = 0.0;  // about the mass, were the learnt model error a constant torque [1/kg^2]
     for (int i = 0; i < arm_->n(); ++i) {
       const double torque = dot(J[u(i)], a_c - g), share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
       variance[u(i)] += mass_variance * torque * torque * std::min(1.0, mass_variance * share * share);
+      information += torque * torque / std::max(model_error_[u(i)] - least_model_error, 1e-12);
     }
+    unexplained_variance_ = 1.0 / std::max(information, 1e-12);
   }
 
   void start_hypothesis(Hypothesis& hyp, std::int64_t now) noexcept {
@@ -272,19 +296,20 @@ class PayloadFilter {
   void look_for_change(const JointSample& s) noexcept {
     const Hypothesis* best = nullptr;
     double best_score = config_.change_threshold * config_.change_threshold;
+    const double prior_information = 1.0 / (mass_prior_std_ * mass_prior_std_);
+    const auto jump_of = [&](const Hypothesis& hyp) { return hyp.num / (hyp.den + prior_information); };
     for (const Hypothesis& hyp : hypotheses_) {
-      if (!(hyp.den > 0.0)) continue;
-      const double score = hyp.num * hyp.num / hyp.den / surprise();
-      if (score > best_score && std::abs(hyp.num / hyp.den) >= config_.min_change) {
+      const double score = hyp.num * jump_of(hyp) / surprise();
+      if (hyp.den > 0.0 && score > best_score && std::abs(jump_of(hyp)) >= config_.min_change) {
         best_score = score;
         best = &hyp;
       }
     }
-    if (best != nullptr && mass_std() < config_.mass_prior_std / 3.0) {
-      const double jump = best->num / best->den;
+    if (best != nullptr && mass_std() < mass_prior_std_ / 3.0) {
+      const double jump = jump_of(*best);
       // A small one soon after a change is what the first guess of its size and instant left over: corrected, not counted.
       const bool correction = changes_ > 0 && s.time_ns - change_seen_ns_ < 1'000'000'000 && std::abs(jump) < 0.5 * last_jump_;
-      const double prior = correction ? 2.0 * std::abs(jump) : config_.mass_prior_std;
+      const double prior = correction ? 2.0 * std::abs(jump) : mass_prior_std_;
       if (!correction) {
         ++changes_;
         change_time_ns_ = best->since;
@@ -312,7 +337,7 @@ class PayloadFilter {
   Payload report(const JointSample&, Status status) const noexcept {
     Payload out;
     out.mass = filter_.parameter(0);
-    out.mass_std = mass_std();
+    out.mass_std = std::hypot(mass_std(), std::sqrt(unexplained_variance_));
     for (int k = 1; k < loads_; ++k) {
       out.first_moment[u(k - 1)] = filter_.parameter(k);
       out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0));
@@ -320,14 +345,15 @@ class PayloadFilter {
     out.changes = changes_;
     out.change_time_ns = change_time_ns_;
     out.status = status;
-    if (status == Status::ok && !(out.mass_std <= std::max(config_.ok_relative * std::abs(out.mass), config_.ok_absolute)))
-      out.status = Status::warming;
+    const bool sure = out.mass_std <= std::max(config_.ok_relative * std::abs(out.mass), config_.ok_absolute);
+    if (status == Status::ok && !(sure && explained())) out.status = Status::warming;
     return out;
   }
 
   const Arm* arm_;
   PayloadFilterConfig config_;
   int loads_, biases_;
+  double initial_prior_std_, mass_prior_std_ = 0.0;  // [kg]; the latter is widened if need be
   Filter filter_;
   std::array<Inertia<double>, 4> unit_;
   static constexpr double least_model_error = 1e-6;  // [N^2 m^2]
@@ -339,6 +365,8 @@ class PayloadFilter {
   std::uint32_t changes_ = 0;
   std::int64_t change_time_ns_ = 0, change_seen_ns_ = 0;
   double last_jump_ = 0.0;  // [kg]
+  double unexplained_variance_ = 0.0;  // of the mass, by what the model gets wrong [kg^2]
+  double unexplained_time_ = 0.0;      // [s]
 };
 
 }  // namespace palpate

@@ -100,7 +100,7 @@ class Pipeline {
     return gain;
   }
 
-  /// How late the observer's torque is [s].
+  /// How late the observer's torque is now [s].
   double lag() const noexcept {
     return std::visit(
         [](const auto& observer) {
@@ -134,15 +134,11 @@ class Pipeline {
     struct {
       const Arm& arm;
       decltype(payload_)& to;
-      double lag;
       void operator()(std::monostate) const { to.emplace<std::monostate>(); }
       void operator()(const JointFormulaConfig& c) const { to.emplace<JointFormula>(arm, c); }
-      void operator()(RegressionConfig c) const {
-        if (std::isnan(c.lag)) c.lag = lag;
-        to.emplace<Regression>(arm, c);
-      }
+      void operator()(const RegressionConfig& c) const { to.emplace<Regression>(arm, c); }
       void operator()(const PayloadFilterConfig& c) const { to.emplace<PayloadFilter>(arm, c); }
-    } payload_maker{arm, payload_, lag()};
+    } payload_maker{arm, payload_};
     std::visit(payload_maker, config_.payload);
     const bool needs_torque = std::holds_alternative<JointFormulaConfig>(config_.payload) || std::holds_alternative<RegressionConfig>(config_.payload);
     if (needs_torque && std::holds_alternative<std::monostate>(config_.observer))
@@ -178,7 +174,9 @@ class Pipeline {
     touch.payload = formula.step(s.q, touch.dq, touch.external);
     if (detail::unusable(s)) touch.payload.status = Status::held;
   }
-  void weigh(Regression& regression, const JointSample& s, Touch& touch) noexcept { touch.payload = regression.step(s, touch.external); }
+  void weigh(Regression& regression, const JointSample& s, Touch& touch) noexcept {
+    touch.payload = regression.step(s, touch.external, lag());
+  }
   void weigh(PayloadFilter& filter, const JointSample& s, Touch& touch) noexcept {
     touch.payload = filter.step(s);
     touch.q = filter.positions();

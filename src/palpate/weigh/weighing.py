@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._core import ExtendedKalman, PayloadFilter, Status, __version__
+from .._core import PayloadFilter, Status, __version__
 from ..arm import Arm, Array
 from ..errors import ArmError, InputError, suggest
 from ..logs import Log
@@ -27,8 +27,6 @@ TWO_SIDED_95 = 1.959963984540054
 """half width of the 95 % interval of a normal distribution [standard deviations]"""
 _HOPELESS = 2.0
 """an arm whose pose takes so many times its torque limit does not lift but is dragged along"""
-_KALMAN_LAG = 0.3
-"""of the extended Kalman filter's external torque, for the regression behind it; no pipeline knows it [s]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,10 +347,7 @@ def make_pipeline(
         raise InputError(
             f"estimator {estimator!r} weighs an external torque: choose an observer, one of {', '.join(OBSERVERS)}"
         )
-    payload = ESTIMATORS[estimator]()
-    if estimator == "regression" and isinstance(chosen, ExtendedKalman):
-        payload = ESTIMATORS[estimator](lag=_KALMAN_LAG)
-    return Pipeline(arm, observer=chosen, payload=payload), tuple(remarks)
+    return Pipeline(arm, observer=chosen, payload=ESTIMATORS[estimator]()), tuple(remarks)
 
 
 def _observer_options(arm: Arm, name: str) -> dict[str, Any]:

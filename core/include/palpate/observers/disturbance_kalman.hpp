@@ -54,8 +54,8 @@ class DisturbanceKalman {
       friction_variance_[u] = error * error;
     }
     momentum_noise(s);
-    // Before `ok` the velocity is not known (nor is it after a gap, as a mean): momentum starts with the first one that is.
-    if (!known_ || s.status != Status::ok || !(s.dt > 0.0)) {
+    const bool known = detail::knows_velocity(s);
+    if (!known_ || !known || s.status == Status::gap || !(s.dt > 0.0)) {
       if (s.status == Status::gap) forget_disturbance();
       start(t.p);
     } else {
@@ -63,7 +63,7 @@ class DisturbanceKalman {
       update(t.p);
     }
     beta_ = beta;
-    known_ = s.status == Status::ok;
+    known_ = known;
     if (!healthy()) {  // start over rather than report what came out of it
       d_ = {};
       forget_disturbance();
@@ -87,12 +87,25 @@ class DisturbanceKalman {
     return out;
   }
 
+  /// How late the external torque is [s], the slowest joint's: the variance of d over its growth per second. That is the delay
+  /// at low frequencies of any settled Kalman filter that follows a random walk.
+  double lag() const noexcept {
+    double slowest = 0.0;
+    for (int i = 0; i < arm_->n(); ++i) slowest = std::max(slowest, P_dd_(i, i) / growth(i, 0.0));
+    return slowest;
+  }
+
   /// Filtered momentum M q' [N m s] and the joint velocity noise seen through M [N^2 m^2 s^2].
   const JointVector& momentum() const noexcept { return p_; }
   const JointMatrix& momentum_noise() const noexcept { return R_; }
 
  private:
   static constexpr std::size_t u(int i) noexcept { return static_cast<std::size_t>(i); }
+
+  /// Variance that d gains per second of a step of h, by its own wandering and by that of the friction's error [N^2 m^2/s].
+  double growth(int i, double h) const noexcept {
+    return square(config_.disturbance_rate) + 2.0 * friction_variance_[u(i)] / std::max(config_.friction_time, h);
+  }
 
   /// R = M D M^T; M is refreshed once a joint has moved by 0.1 rad.
   void momentum_noise(const JointSample& s) noexcept {
@@ -146,8 +159,7 @@ class DisturbanceKalman {
       for (int j = 0; j < n; ++j) P_pd_(i, j) = phi * (P_pd_(i, j) + g * P_dd_old_(i, j));
     for (int i = 0; i < n; ++i) {
       const double torque = arm_->torque_variance(i) + square(config_.model_torque_std) + 0.5 * square(slope[u(i)] * s.dq_std[u(i)]);
-      const double error = friction_variance_[u(i)];
-      const double wander = square(config_.disturbance_rate) * h + 2.0 * error * std::min(1.0, h / config_.friction_time) +
+      const double wander = growth(i, h) * h +
                             turned[u(i)] * square(arm_->joint(i).friction.uncertainty(0.0, config_.friction_fraction));
       P_pp_(i, i) += h * h * (torque + wander / 3.0);
       P_pd_(i, i) += 0.5 * h * wander;
@@ -217,7 +229,10 @@ class DisturbanceKalman {
   ExternalTorque report(Status status) const noexcept {
     ExternalTorque out;
     out.torque = d_;
-    for (int i = 0; i < arm_->n(); ++i) out.std[u(i)] = std::sqrt(P_dd_(i, i) + friction_variance_[u(i)]);
+    for (int i = 0; i < arm_->n(); ++i) {
+      out.noise[u(i)] = std::sqrt(P_dd_(i, i));
+      out.std[u(i)] = std::sqrt(P_dd_(i, i) + friction_variance_[u(i)]);
+    }
     out.status = status;
     return out;
   }
@@ -230,7 +245,7 @@ class DisturbanceKalman {
   JointVector p_{}, d_{}, beta_{}, friction_variance_{}, M_at_{}, dq_std_{};
   JointMatrix P_pp_{}, P_pd_{}, P_dd_{}, P_dd_old_{}, R_{}, M_{};
   std::array<SignTravel, max_joints> travel_{};
-  bool started_ = false, known_ = false;  // M is there; the last sample's velocity was good
+  bool started_ = false, known_ = false;  // M is there; p_ is of a known velocity
 };
 
 static_assert(DisturbanceObserver<DisturbanceKalman>);

@@ -30,20 +30,17 @@ class ExtendedKalman {
     check::positive("ExtendedKalmanConfig disturbance_prior_std [N m]", config.disturbance_prior_std);
     check::positive("ExtendedKalmanConfig velocity_prior_std [rad/s]", config.velocity_prior_std);
     check::not_negative("ExtendedKalmanConfig model_torque_std [N m]", config.model_torque_std);
+    check::not_negative("ExtendedKalmanConfig friction_fraction [1]", config.friction_fraction);
     check::positive("ExtendedKalmanConfig max_step [s]", config.max_step);
     decay_.fill(1.0);
-    for (int i = 0; i < arm.n(); ++i) {
+    for (int i = 0; i < arm.n(); ++i)
       torque_variance_[detail::at(i)] = arm.torque_variance(i) + config.model_torque_std * config.model_torque_std;
-      if (config.disturbance)
-        filter_.set_parameter(i, 0.0, config.disturbance_prior_std * config.disturbance_prior_std);
-    }
   }
 
   ExternalTorque step(const JointSample& s) noexcept {
     if (s.status == Status::non_finite || s.status == Status::time_error) return report(Status::held);
     if (!started_ || s.status == Status::gap || !(s.dt > 0.0)) {
-      filter_.start(*arm_, s, config_.velocity_prior_std);
-      started_ = true;
+      start(s, true);
       return report(s.status == Status::gap ? Status::gap : Status::warming);
     }
     const int steps = 1 + static_cast<int>(s.dt / config_.max_step);
@@ -57,22 +54,45 @@ class ExtendedKalman {
     }
     filter_.measure_joints(*arm_, s, [](int, int, const auto&) {});
     if (!filter_.healthy()) {  // start over rather than report what came out of it
-      if (config_.disturbance)
-        for (int i = 0; i < arm_->n(); ++i)
-          filter_.set_parameter(i, 0.0, config_.disturbance_prior_std * config_.disturbance_prior_std);
-      filter_.start(*arm_, s, config_.velocity_prior_std);
+      start(s, false);
       return report(Status::warming);
     }
-    return report(Status::ok);
+    return report(learnt() ? Status::ok : Status::warming);
   }
 
   void reset() { *this = ExtendedKalman(*arm_, config_); }
+
+  /// How late the external torque is [s], the slowest joint's: variance over disturbance_rate^2. That is the delay at low
+  /// frequencies of any settled Kalman filter that follows a random walk; infinite without a disturbance.
+  double lag() const noexcept {
+    double slowest = 0.0;
+    for (int i = 0; i < arm_->n(); ++i)
+      slowest = std::max(slowest, config_.disturbance ? filter_.parameter_variance(i) / square(config_.disturbance_rate)
+                                                      : std::numeric_limits<double>::infinity());
+    return slowest;
+  }
 
   JointVector positions() const noexcept { return filter_.positions(); }
   JointVector velocities() const noexcept { return filter_.velocities(); }
   const JointKalman<max_joints>& filter() const noexcept { return filter_; }
 
  private:
+  static constexpr double square(double x) noexcept { return x * x; }
+
+  /// Nothing is known of the external torque now; the last estimate is its mean if it is worth that.
+  void start(const JointSample& s, bool keep_mean) noexcept {
+    filter_.start(*arm_, s, config_.velocity_prior_std);
+    if (config_.disturbance)
+      for (int i = 0; i < arm_->n(); ++i)
+        filter_.set_parameter(i, keep_mean ? filter_.parameter(i) : 0.0, square(config_.disturbance_prior_std));
+    started_ = true;
+  }
+  bool learnt() const noexcept {
+    if (config_.disturbance)
+      for (int i = 0; i < arm_->n(); ++i)
+        if (filter_.parameter_variance(i) > square(0.5 * config_.disturbance_prior_std)) return false;
+    return true;
+  }
   ExternalTorque report(Status status) const noexcept {
     ExternalTorque out;
     out.status = config_.disturbance ? status : Status::held;

@@ -59,8 +59,8 @@ class InverseDynamicsObserver {
 
   ExternalTorque step(const JointSample& s) noexcept {
     if (detail::unusable(s)) return filter_.report(Status::held);
-    const bool continues = started_ && s.dt > 0.0 && s.status != Status::gap;
-    if (continues && s.status != Status::warming) {
+    const bool known = detail::knows_velocity(s);
+    if (known_ && known && s.dt > 0.0 && s.status != Status::gap) {
       const int n = arm_->n();
       JointVector q{}, dq{}, ddq{};  // at the middle of the step, where the difference of velocities is the acceleration
       for (int j = 0; j < n; ++j) {
@@ -78,12 +78,12 @@ class InverseDynamicsObserver {
         noise[u] = arm_->torque_variance(j) + 2.0 * p_variance[u] * (wdt / s.dt) * (wdt / s.dt);
       }
       filter_.step(s, residual, noise, config_.friction_fraction);
-    } else if (!continues) {
+    } else {
       filter_.restart();
     }
     q_ = s.q;
     dq_ = s.dq;
-    started_ = true;
+    known_ = known;
     return filter_.report(s.status);
   }
 
@@ -98,7 +98,7 @@ class InverseDynamicsObserver {
   detail::ResidualFilter filter_;
   detail::MomentumNoise noise_{};
   JointVector q_{}, dq_{};
-  bool started_ = false;
+  bool known_ = false;  // dq_ is a velocity
 };
 
 struct ModelResidualConfig {

@@ -31,8 +31,8 @@ class MomentumObserver {
       const auto u = detail::at(j);
       beta[u] = t.Ct_dq[u] - t.g[u] - arm_->joint(j).friction.torque(s.dq[u]);
     }
-    const bool continues = started_ && s.dt > 0.0 && s.status != Status::gap;
-    if (continues) {
+    const bool known = detail::knows_velocity(s);
+    if (known_ && known && s.dt > 0.0 && s.status != Status::gap) {
       const double a = std::exp(-config_.bandwidth * s.dt), b = 1.0 - a;
       const JointVector& p_variance = noise_.variance(*arm_, s);
       for (int j = 0; j < n; ++j) {
@@ -45,13 +45,11 @@ class MomentumObserver {
       }
       elapsed_ += s.dt;
     } else {
-      if (s.status != Status::gap) r_ = {};
       elapsed_ = 0.0;
     }
     p_ = t.p;
     beta_ = beta;
-    started_ = true;
-    if (s.status == Status::gap) return report(Status::gap);
+    known_ = known;
     // After three time constants 95 % of a constant torque is seen.
     return report(s.status != Status::ok ? s.status : elapsed_ * config_.bandwidth < 3.0 ? Status::warming : Status::ok);
   }
@@ -69,7 +67,7 @@ class MomentumObserver {
   detail::MomentumNoise noise_{};
   JointVector p_{}, beta_{}, r_{}, variance_{}, friction_{};
   double elapsed_ = 0.0;
-  bool started_ = false;
+  bool known_ = false;  // p_ is of a known velocity
 };
 
 static_assert(DisturbanceObserver<MomentumObserver>);

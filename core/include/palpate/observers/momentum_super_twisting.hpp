@@ -17,7 +17,8 @@ struct SuperTwistingConfig {
 /// would remain without injection, the solution is e+ = 0, z+ = z + c/dt if |c| <= alpha dt^2, else e+ = y^2 sgn c with
 /// y^2 + lambda dt y + alpha dt^2 - |c| = 0. Hence no chattering, whatever the sampling time. (MATH.md section 3.)
 ///
-/// `saturated`: sgn e has kept one value for a quarter of a second: the torque changes faster than max_rate.
+/// `saturated`: sgn e has kept one value for a tenth of a second, or had so a tenth of a second ago (then z may have run past
+/// the torque): the torque changes faster than max_rate.
 /// Standard deviation: sqrt(2 L std(p)), Levant's order of accuracy under noise, and the friction's.
 class MomentumSuperTwisting {
  public:
@@ -39,9 +40,10 @@ class MomentumSuperTwisting {
       const auto u = detail::at(j);
       beta[u] = t.Ct_dq[u] - t.g[u] - arm_->joint(j).friction.torque(s.dq[u]);
     }
-    bool saturated = false;
-    if (started_ && s.dt > 0.0 && s.status != Status::gap) {
+    const bool known = detail::knows_velocity(s);
+    if (known_ && known && s.dt > 0.0 && s.status != Status::gap) {
       const double h = s.dt;
+      bool outrun = false;
       const JointVector& p_variance = noise_.variance(*arm_, s);
       for (int j = 0; j < n; ++j) {
         const auto u = detail::at(j);
@@ -54,29 +56,30 @@ class MomentumSuperTwisting {
         }
         z_[u] += h * alpha_ * sign;
         p_hat_[u] = t.p[u] - e;
-        one_sided_[u] = sign * side_[u] >= 1.0 ? one_sided_[u] + h : 0.0;
+        one_sided_[u] = std::abs(sign) < 1.0 ? 0.0 : (sign * side_[u] >= 1.0 ? one_sided_[u] : 0.0) + h;
         side_[u] = sign;
-        saturated = saturated || one_sided_[u] > 0.25;
+        outrun = outrun || one_sided_[u] >= settling_time;
         const double friction = arm_->joint(j).friction.uncertainty(s.dq[u], config_.friction_fraction);
         variance_[u] = 2.0 * config_.max_rate * std::sqrt(p_variance[u]);
         friction_[u] = friction;
       }
       elapsed_ += h;
+      since_outrun_ = outrun ? 0.0 : since_outrun_ + h;
     } else {
       p_hat_ = t.p;
-      if (s.status != Status::gap) z_ = {};
+      side_ = one_sided_ = {};
       elapsed_ = 0.0;
     }
     beta_ = beta;
-    started_ = true;
-    if (s.status == Status::gap) return report(Status::gap);
+    known_ = known;
     if (s.status != Status::ok) return report(s.status);
-    return report(elapsed_ < 0.1 ? Status::warming : saturated ? Status::saturated : Status::ok);
+    return report(elapsed_ < settling_time ? Status::warming : since_outrun_ < settling_time ? Status::saturated : Status::ok);
   }
 
   void reset() { *this = MomentumSuperTwisting(*arm_, config_); }
 
  private:
+  static constexpr double settling_time = 0.1;  // [s]
   ExternalTorque report(Status status) const noexcept { return detail::report(arm_->n(), z_, variance_, friction_, status); }
 
   const Arm* arm_;
@@ -84,8 +87,8 @@ class MomentumSuperTwisting {
   double alpha_ = 0.0, lambda_ = 0.0;  // [N m/s], [sqrt(N m) / sqrt(s) ...]: see the class comment
   detail::MomentumNoise noise_{};
   JointVector p_hat_{}, beta_{}, z_{}, variance_{}, friction_{}, side_{}, one_sided_{};
-  double elapsed_ = 0.0;
-  bool started_ = false;
+  double elapsed_ = 0.0, since_outrun_ = 1e9;  // [s]
+  bool known_ = false;  // p_hat_ comes from a known velocity
 };
 
 static_assert(DisturbanceObserver<MomentumSuperTwisting>);

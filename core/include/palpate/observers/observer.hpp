@@ -21,6 +21,10 @@ inline bool unusable(const JointSample& s) noexcept {
   return s.status == Status::non_finite || s.status == Status::time_error;
 }
 
+/// Whether dq is the velocity at the sample. A differentiated one is not before `ok`, nor at a gap, where it is a mean: what
+/// differences momenta or velocities begins with the first sample that has one, or a start in motion would look like a push.
+inline bool knows_velocity(const JointSample& s) noexcept { return s.velocity_measured || s.status == Status::ok; }
+
 /// An external torque with the variance of its noise, the deviation of its friction model and its status as the struct that
 /// travels on.
 inline ExternalTorque report(int n, const JointVector& torque, const JointVector& variance, const JointVector& friction,
@@ -43,20 +47,23 @@ class MomentumNoise {
     bool moved = !valid_;
     for (int j = 0; j < arm.n(); ++j) moved = moved || std::abs(s.q[at(j)] - q_[at(j)]) > 0.1;
     if (moved) {
-      const JointMatrix M = mass_matrix<double>(arm, s.q);
-      for (int i = 0; i < arm.n(); ++i) {
-        double sum = 0.0;
-        for (int j = 0; j < arm.n(); ++j) sum += M(i, j) * M(i, j) * s.dq_std[at(j)] * s.dq_std[at(j)];
-        variance_[at(i)] = sum;
-      }
+      M_ = mass_matrix<double>(arm, s.q);
       q_ = s.q;
       valid_ = true;
+    }
+    if (!moved && s.dq_std == dq_std_) return variance_;
+    dq_std_ = s.dq_std;
+    for (int i = 0; i < arm.n(); ++i) {
+      double sum = 0.0;
+      for (int j = 0; j < arm.n(); ++j) sum += M_(i, j) * M_(i, j) * s.dq_std[at(j)] * s.dq_std[at(j)];
+      variance_[at(i)] = sum;
     }
     return variance_;
   }
 
  private:
-  JointVector q_{}, variance_{};
+  JointMatrix M_{};
+  JointVector q_{}, dq_std_{}, variance_{};
   bool valid_ = false;
 };
 

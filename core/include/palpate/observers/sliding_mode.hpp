@@ -103,6 +103,9 @@ class SlidingModeObserver {
     return report(one_sided || since_astray_ < settle ? Status::saturated : elapsed_ < settle ? Status::warming : Status::ok);
   }
 
+  /// How late the torque is [s]: the delay of the Butterworth low-pass at low frequencies.
+  double lag() const noexcept { return 1.0 / (config_.cutoff * std::sin(std::numbers::pi / (2.0 * config_.order))); }
+
   void reset() { *this = SlidingModeObserver(*arm_, config_); }
 
   const JointVector& positions() const noexcept { return x1_; }   ///< x1 [rad]
@@ -157,7 +160,7 @@ class SlidingModeObserver {
       if (config_.friction) {
         const Friction& friction = arm_->joint(j).friction;
         r[u] -= h * friction.torque(x2_[u]);
-        W(j, j) += h * friction.derivative(x2_[u]);
+        W(j, j) += h * std::max(friction.derivative(x2_[u]), 0.0);  // falling friction (Stribeck) keeps its value over the step
       }
     }
     const JointVector dv = Cholesky<double>(W, arm_->n()).solve(r);
