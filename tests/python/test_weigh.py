@@ -36,7 +36,7 @@ def session(
         poses=(W.find_pose(scene, pose or scene.pose)[1],),
         **{"loads": ((0.0, held),), "duration": 5.0, **task},
     )
-    pipeline, _ = W.make_pipeline(scene.arm, estimator, observer, mass_prior=scene.mass_prior)
+    pipeline, _ = W.make_pipeline(scene.arm, estimator, observer)
     return W.run(plan, pipeline, record=record)
 
 

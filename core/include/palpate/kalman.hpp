@@ -302,6 +302,8 @@ class JointKalman {
     for (int r = 0; r < dim_; ++r)
       for (int c = r + 1; c < dim_; ++c) P_[u(c * dim_ + r)] = P_[u(r * dim_ + c)];
   }
+  /// White within the step too: were it constant there, a large one would leave a velocity error that alternates from sample to
+  /// sample, which the positions at the samples cannot see.
   void add_torque_noise(const JointVector& variance) noexcept {
     const int columns_x = active_ + n_;
     for (int i = 0; i < n_; ++i)
@@ -312,7 +314,7 @@ class JointKalman {
         P_[u((n_ + i) * dim_ + n_ + j)] += s;
         P_[u(i * dim_ + n_ + j)] += hi * s;
         P_[u((n_ + i) * dim_ + j)] += s * hj;
-        P_[u(i * dim_ + j)] += hi * s * hj;
+        P_[u(i * dim_ + j)] += hi * s * hj + h_ * h_ / 12.0 * s;
       }
   }
 

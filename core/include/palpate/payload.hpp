@@ -19,10 +19,12 @@ inline std::array<Inertia<double>, 4> load_basis(const Arm& arm) noexcept {
 }
 
 /// Forward, at rest or backward, per joint: while it stays, so does the error of the friction model.
-/// A joint rests as soon as it is slow, and until it has left that place: what holds it there is one torque, however often a noisy
-/// velocity, or trembling on the spot, crosses zero.
+/// A joint rests as soon as it is slow, and until it has left that place by more than `presliding` [rad]: what holds it there is
+/// one torque, however often a noisy velocity, or trembling on the spot, crosses zero.
 class Regime {
  public:
+  explicit Regime(double presliding = 0.0) : presliding_(presliding) {}
+
   /// True if joint j has started, stopped or reversed. q, dq [rad, rad/s].
   bool changed(const Arm& arm, int j, double q, double dq) noexcept {
     const double v0 = arm.joint(j).friction.sign_velocity;
@@ -33,7 +35,8 @@ class Regime {
     }
     if (joint.direction == 0) {
       const double away = q - joint.stopped_at;
-      if (std::abs(away) < presliding + 4.0 * std::sqrt(arm.position_variance(j)) || std::abs(dq) < 1.25 * v0) return false;
+      const double noise = 4.0 * std::sqrt(arm.position_variance(j));
+      if (std::abs(dq) < 1.25 * v0 || (presliding_ > 0.0 && std::abs(away) < presliding_ + noise)) return false;
       joint.direction = dq > 0.0 ? 1 : -1;
       return true;
     }
@@ -45,12 +48,12 @@ class Regime {
   bool at_rest(int j) const noexcept { return joints_[at(j)].direction == 0; }
 
  private:
-  static constexpr double presliding = 5e-3;  // [rad]
   struct Joint {
     bool known = false;
     int direction = 0;
     double stopped_at = 0.0;  // [rad]
   };
+  double presliding_;
   std::array<Joint, max_joints> joints_{};
 };
 

@@ -155,7 +155,7 @@ class PayloadFilter {
 
   void begin(const JointSample& s) noexcept {
     filter_.start(*arm_, s, config_.velocity_prior_std);
-    regime_ = {};
+    regime_ = detail::Regime(presliding);
     for (int i = 0; i < biases_; ++i) redraw_bias(i);
     started_ = true;
     restart_hypotheses();
@@ -232,7 +232,8 @@ class PayloadFilter {
     for (int i = 0; i < arm_->n(); ++i) {
       const double excess = surprise_[u(i)] - 1.3;
       const double rate = excess > 0.0 ? std::min(excess, 3.0) / 0.02 : std::max(excess, -1.0) / 1.0;
-      model_error_[u(i)] = std::clamp(model_error_[u(i)] * std::exp(std::min(rate * dt, 2.0)), least_model_error, 1e6);
+      const double factor = std::exp(std::min(rate * dt, 2.0));
+      model_error_[u(i)] = std::clamp(model_error_[u(i)] * factor, least_model_error, 1e6);
     }
   }
   /// Whether the state explains what every joint does now.
@@ -359,7 +360,8 @@ class PayloadFilter {
   static constexpr double least_model_error = 1e-6;  // [N^2 m^2]
   JointVector torque_variance_{}, surprise_{}, model_error_{};
   Filter::Parameters decay_{};
-  detail::Regime regime_{};
+  static constexpr double presliding = 5e-3;  // [rad]
+  detail::Regime regime_{presliding};
   std::array<Hypothesis, 12> hypotheses_;
   bool started_ = false;
   std::uint32_t changes_ = 0;

@@ -140,7 +140,7 @@ def run(
     if png is not None:
         check_target(png, is_png, "the picture")
     film = None if frames is None else _Film(make_folder(frames))
-    pipeline, _ = weighing.make_pipeline(scene.arm, mass_prior=scene.mass_prior)
+    pipeline, _ = weighing.make_pipeline(scene.arm)
     with interruptible() as stopped, _progress(task, json or quiet) as progress:
         session = weighing.run(
             task,

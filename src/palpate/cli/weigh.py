@@ -184,7 +184,7 @@ def run(
             seed=seed,
             speed=2.0 if live and speed is None else speed,
         )
-        pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer, mass_prior=scene.mass_prior)
+        pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer)
         target = None
         if record:
             target = make_folder(out) / "run.mcap"

@@ -55,8 +55,6 @@ class Scene:
     """what it lifts, unless told otherwise [kg]"""
     gains: tuple[Array, Array] | None
     """published kp [N m/rad] and kd [N m s/rad] of the controller, (n,) each; None: :func:`gains_at`"""
-    mass_prior: float | None = None
-    """standard deviation of the mass before anything is known, for the payload filter [kg]; None: its own"""
     assumed: tuple[str, ...] = ()
     """what the arm's description leaves open and what was taken instead, one sentence each"""
 
@@ -152,10 +150,9 @@ def scene(arm: Arm, *, mass: float | None = None) -> Scene:
         # many arms stand upright at zero: there a load has no lever, and falls whichever way
         poses[start] = _vector(0.5 * (poses[zero] + poses[pose]))
     gains: tuple[Array, Array] | None = None
-    prior: float | None = 4.0 * reference.mass
     if reference.kp is not None and reference.kd is not None:
-        gains, prior = (_vector(reference.kp), _vector(reference.kd)), None
-    return Scene(arm, MappingProxyType(poses), pose, start, reference.mass, gains, prior, assumed)
+        gains = (_vector(reference.kp), _vector(reference.kd))
+    return Scene(arm, MappingProxyType(poses), pose, start, reference.mass, gains, assumed)
 
 
 def gains_at(arm: Arm, q: Array, period: float) -> tuple[Array, Array]:

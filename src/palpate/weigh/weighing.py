@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._core import PayloadFilter, Status, __version__
+from .._core import Status, __version__
 from ..arm import Arm, Array
 from ..errors import ArmError, InputError, suggest
 from ..logs import Log
@@ -291,7 +291,6 @@ def make_pipeline(
     observer: str | None = None,
     *,
     model_torque: bool = False,
-    mass_prior: float | None = None,
 ) -> tuple[Pipeline, tuple[str, ...]]:
     """The pipeline that weighs, from names.
 
@@ -301,7 +300,6 @@ def make_pipeline(
             masses.
         observer: one of palpate.pipeline.OBSERVERS, or "none"; None: what suits the estimator.
         model_torque: the samples carry the controller's own model torque.
-        mass_prior: standard deviation of the mass before anything is known, for the payload filter [kg]; None: its own.
 
     Returns:
         the pipeline, and what was decided that a person should know.
@@ -339,10 +337,7 @@ def make_pipeline(
         name = observer or "extended-kalman"
         chosen = OBSERVERS[name](**_observer_options(arm, name))
     if estimator == "payload-filter":
-        if mass_prior is None:
-            return Pipeline(arm, observer=chosen), tuple(remarks)
-        load = PayloadFilter(first_moment=True, offset_prior_std=0.02, mass_prior_std=mass_prior)
-        return Pipeline(arm, observer=chosen, payload=load), tuple(remarks)
+        return Pipeline(arm, observer=chosen), tuple(remarks)
     if chosen is None:
         raise InputError(
             f"estimator {estimator!r} weighs an external torque: choose an observer, one of {', '.join(OBSERVERS)}"
