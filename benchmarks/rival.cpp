@@ -1,18 +1,18 @@
 // The rival's entries: the same observers and filters on Pinocchio's dynamics and Eigen's fixed-size matrices. What is neither
-// (friction, low-pass) is palpate's own code, compiled with this file's flags.
+// (friction, low-pass) is palpate's own code.
 #include "contest.hpp"
 #include "palpate/observers/momentum.hpp"
 #include "palpate/observers/sliding_mode.hpp"
-#include "rival_kalman.hpp"
+#include "rival.hpp"
 
 namespace {
 
 using namespace rival;
 using contest::Job;
+using contest::Arm;
+using contest::ArmDescription;
+using contest::JointSample;
 using contest::Numbers;
-using palpate::Arm;
-using palpate::ArmDescription;
-using palpate::JointSample;
 
 /// Everything a job needs of the arm.
 struct Rival {
@@ -69,38 +69,14 @@ struct ForwardDynamicsByCholesky : ForwardDynamics {
 
 // --- momentum observer -------------------------------------------------------------------------------------------
 
-/// p, C^T q' and g from three algorithms.
-struct TermsByMatrices {
-  static void compute(Dynamics& d, const Vector& q, const Vector& dq, Vector& p, Vector& Ct_dq, Vector& g) {
-    g = d.gravity(q);
-    p.noalias() = d.mass_matrix(q).selfadjointView<Eigen::Upper>() * dq;
-    Ct_dq.noalias() = d.coriolis(q, dq).transpose() * dq;
-  }
-};
-
-/// p = M q' as inverse dynamics at q'' = q' without M.
-struct TermsByNewtonEuler {
-  static void compute(Dynamics& d, const Vector& q, const Vector& dq, Vector& p, Vector& Ct_dq, Vector& g) {
-    g = d.gravity(q);
-    p = d.inverse(q, Vector::Zero(), dq) - g;
-    Ct_dq.noalias() = d.coriolis(q, dq).transpose() * dq;
-  }
-};
-
-struct TermsByOwnSweep {
-  static void compute(Dynamics& d, const Vector& q, const Vector& dq, Vector& p, Vector& Ct_dq, Vector& g) {
-    d.momentum_terms(q, dq, p, Ct_dq, g);
-  }
-};
-
 /// MomentumObserver::step with Eigen's vectors.
-template <class Terms>
 class Momentum : Rival {
  public:
-  using Rival::Rival;
+  using Terms = void (Dynamics::*)(const Vector& q, const Vector& dq, Vector& p, Vector& Ct_dq, Vector& g);
+  Momentum(const ArmDescription& description, Terms terms) : Rival(description), terms_(terms) {}
   void step(const JointSample& s) {
     Vector p, Ct_dq, g, beta;
-    Terms::compute(dynamics, in(s.q), in(s.dq), p, Ct_dq, g);
+    (dynamics.*terms_)(in(s.q), in(s.dq), p, Ct_dq, g);
     for (int j = 0; j < N; ++j) beta[j] = Ct_dq[j] - g[j] - arm.joint(j).friction.torque(s.dq[u(j)]);
     if (started_) {
       const double a = std::exp(-config_.bandwidth * s.dt), b = 1.0 - a;
@@ -130,6 +106,7 @@ class Momentum : Rival {
     p_variance_ = M.cwiseAbs2() * in(s.dq_std).cwiseAbs2();
     noise_q_ = in(s.q);
   }
+  Terms terms_;
   palpate::MomentumConfig config_;
   bool started_ = false;
   Vector p_ = Vector::Zero(), beta_ = Vector::Zero(), r_ = Vector::Zero(), std_ = Vector::Zero();
@@ -215,24 +192,25 @@ class SlidingMode : Rival {
 
 }  // namespace
 
-/// The rival's ways of doing a job, each timed.
-extern "C" void PALPATE_RIVAL(const ArmDescription* arm, Job job, contest::Entries* entries) {
+std::unique_ptr<contest::Entry> rival_filter(const ArmDescription& arm, Job job);  // rival_kalman.cpp
+
+/// The rival's ways of doing a job.
+contest::Entries pinocchio_entries(const ArmDescription& arm, Job job) {
+  contest::Entries entries;
   const auto enter = [&]<class Work>(std::type_identity<Work>, const char* how, auto... more) {
-    entries->push_back(std::make_unique<contest::Timed<Work>>(how, *arm, more...));
+    entries.push_back(std::make_unique<contest::Timed<Work>>(how, arm, more...));
   };
-  constexpr const char* filter = "crba, computeABADerivatives, Eigen";
   switch (job) {
     case Job::momentum:
-      enter(std::type_identity<Momentum<TermsByMatrices>>{}, "crba, computeCoriolisMatrix, computeGeneralizedGravity");
-      enter(std::type_identity<Momentum<TermsByNewtonEuler>>{}, "rnea, computeCoriolisMatrix, computeGeneralizedGravity");
-      enter(std::type_identity<Momentum<TermsByOwnSweep>>{}, "by hand: palpate's sweep on forwardKinematics");
+      enter(std::type_identity<Momentum>{}, "computeGeneralizedGravity, rnea, computeCoriolisMatrix", &Dynamics::momentum_terms);
+      enter(std::type_identity<Momentum>{}, "computeCoriolisMatrix and what it leaves", &Dynamics::momentum_terms_from_coriolis);
       break;
     case Job::sliding_mode: enter(std::type_identity<SlidingMode>{}, "crba, 4 nonLinearEffects, LLT", 1); break;
     case Job::sliding_mode_twice: enter(std::type_identity<SlidingMode>{}, "crba, 8 nonLinearEffects, LLT", 2); break;
-    case Job::kalman: enter(std::type_identity<contest::Smoothing>{}, filter, contest::smoother); break;
-    case Job::kalman_disturbance: enter(std::type_identity<contest::Smoothing>{}, filter, contest::kalman_observer); break;
-    case Job::payload_mass: enter(std::type_identity<contest::Weighing>{}, filter, contest::mass_filter); break;
-    case Job::payload_moment: enter(std::type_identity<contest::Weighing>{}, filter, contest::moment_filter); break;
+    case Job::kalman:
+    case Job::kalman_disturbance:
+    case Job::payload_mass:
+    case Job::payload_moment: entries.push_back(rival_filter(arm, job)); break;
     case Job::inverse_dynamics: enter(std::type_identity<InverseDynamics>{}, "rnea"); break;
     case Job::mass_matrix: enter(std::type_identity<MassMatrix>{}, "crba"); break;
     case Job::forward_dynamics:
@@ -240,4 +218,5 @@ extern "C" void PALPATE_RIVAL(const ArmDescription* arm, Job job, contest::Entri
       enter(std::type_identity<ForwardDynamicsByCholesky>{}, "crba, nonLinearEffects, LLT");
       break;
   }
+  return entries;
 }

@@ -29,8 +29,7 @@
 #include "palpate/payload_filter.hpp"
 
 #ifdef PALPATE_HAS_PINOCCHIO
-extern "C" void pinocchio_same_flags(const palpate::ArmDescription* arm, contest::Job job, contest::Entries* entries);
-extern "C" void pinocchio_native(const palpate::ArmDescription* arm, contest::Job job, contest::Entries* entries);
+contest::Entries pinocchio_entries(const palpate::ArmDescription& arm, contest::Job job);  // rival.cpp
 #endif
 
 namespace {
@@ -85,60 +84,17 @@ struct ForwardDynamics {
   JointVector ddq{};
 };
 
-/// An observer with its arm.
-template <class Observer, class Config>
-struct Observing {
-  Observing(const ArmDescription& d, const Config& config) : arm(d), observer(arm, config) {}
-  void step(const JointSample& s) { external = observer.step(s); }
-  Numbers numbers() const {
-    Numbers out;
-    out.add(external.torque, arm.n());
-    out.add(external.std, arm.n());
-    if constexpr (requires { observer.positions(); }) {
-      out.add(observer.positions(), arm.n());
-      out.add(observer.velocities(), arm.n());
-    }
-    return out;
-  }
-  Arm arm;
-  Observer observer;
-  ExternalTorque external{};
-};
-
-struct Weighing {
-  Weighing(const ArmDescription& d, const PayloadFilterConfig& config) : arm(d), filter(arm, config) {}
-  void step(const JointSample& s) { payload = filter.step(s); }
-  Numbers numbers() const {
-    Numbers out;
-    out.add(payload.mass);
-    out.add(payload.mass_std);
-    out.add(payload.first_moment, 3);
-    out.add(payload.first_moment_std, 3);
-    out.add(filter.positions(), arm.n());
-    out.add(filter.velocities(), arm.n());
-    return out;
-  }
-  Arm arm;
-  PayloadFilter filter;
-  Payload payload{};
-};
-
 std::unique_ptr<contest::Entry> ours(const ArmDescription& arm, Job job) {
-  using contest::Timed;
+  using contest::Observing, contest::Timed, contest::Weighing;
   constexpr const char* how = "palpate";
   switch (job) {
-    case Job::momentum: return std::make_unique<Timed<Observing<MomentumObserver, MomentumConfig>>>(how, arm, MomentumConfig{});
-    case Job::sliding_mode:
-      return std::make_unique<Timed<Observing<SlidingModeObserver, SlidingModeConfig>>>(how, arm, SlidingModeConfig{});
-    case Job::sliding_mode_twice:
-      return std::make_unique<Timed<Observing<SlidingModeObserver, SlidingModeConfig>>>(how, arm, SlidingModeConfig{.substeps = 2});
-    case Job::kalman:
-      return std::make_unique<Timed<Observing<ExtendedKalman, ExtendedKalmanConfig>>>(how, arm, ExtendedKalmanConfig{.disturbance = false});
-    case Job::kalman_disturbance:
-      return std::make_unique<Timed<Observing<ExtendedKalman, ExtendedKalmanConfig>>>(how, arm, ExtendedKalmanConfig{});
-    case Job::payload_mass: return std::make_unique<Timed<Weighing>>(how, arm, PayloadFilterConfig{.mass_prior_std = contest::mass_prior_std});
-    case Job::payload_moment: return std::make_unique<Timed<Weighing>>(how, arm, 
-                                                PayloadFilterConfig{.first_moment = true, .mass_prior_std = contest::mass_prior_std});
+    case Job::momentum: return std::make_unique<Timed<Observing<MomentumObserver>>>(how, arm, MomentumConfig{});
+    case Job::sliding_mode: return std::make_unique<Timed<Observing<SlidingModeObserver>>>(how, arm, SlidingModeConfig{});
+    case Job::sliding_mode_twice: return std::make_unique<Timed<Observing<SlidingModeObserver>>>(how, arm, SlidingModeConfig{.substeps = 2});
+    case Job::kalman: return std::make_unique<Timed<Observing<ExtendedKalman>>>(how, arm, contest::smoother<ExtendedKalmanConfig>());
+    case Job::kalman_disturbance: return std::make_unique<Timed<Observing<ExtendedKalman>>>(how, arm, ExtendedKalmanConfig{});
+    case Job::payload_mass: return std::make_unique<Timed<Weighing<PayloadFilter>>>(how, arm, contest::weigher<PayloadFilterConfig>(false));
+    case Job::payload_moment: return std::make_unique<Timed<Weighing<PayloadFilter>>>(how, arm, contest::weigher<PayloadFilterConfig>(true));
     case Job::inverse_dynamics: return std::make_unique<Timed<InverseDynamics>>(how, arm);
     case Job::mass_matrix: return std::make_unique<Timed<MassMatrix>>(how, arm);
     case Job::forward_dynamics: return std::make_unique<Timed<ForwardDynamics>>(how, arm);
@@ -287,26 +243,17 @@ double quantile(std::vector<std::uint32_t>& ticks, double fraction) {
 }
 
 struct Contestant {
-  Contestant(const char* compiled, std::unique_ptr<contest::Entry> e) : flags(compiled), entry(std::move(e)) {}
-  /// Pinocchio lends only types and kinematics; the algorithm is palpate's.
-  bool by_hand() const { return std::strncmp(entry->how(), "by hand", 7) == 0; }
-  const char* flags;
+  explicit Contestant(std::unique_ptr<contest::Entry> e) : entry(std::move(e)) {}
   std::unique_ptr<contest::Entry> entry;
   std::vector<std::uint32_t> all, round;  // ticks of every call, and of those in this round
   Result result;
 };
 
 std::vector<Contestant> contestants(const ArmDescription& arm, Job job) {
-  constexpr const char* same = "-O3 -ffp-contract=off";
   std::vector<Contestant> out;
-  out.emplace_back(same, ours(arm, job));
+  out.emplace_back(ours(arm, job));
 #ifdef PALPATE_HAS_PINOCCHIO
-  contest::Entries entries;
-  pinocchio_same_flags(&arm, job, &entries);
-  for (auto& entry : entries) out.emplace_back(same, std::move(entry));
-  entries.clear();
-  pinocchio_native(&arm, job, &entries);
-  for (auto& entry : entries) out.emplace_back("-O3 -march=native", std::move(entry));
+  for (auto& entry : pinocchio_entries(arm, job)) out.emplace_back(std::move(entry));
 #endif
   return out;
 }
@@ -383,10 +330,9 @@ void print_json(const Task& task, double difference, const std::vector<Contestan
               number(difference).c_str());
   for (const Contestant& c : all) {
     const Result& r = c.result;
-    std::printf("%s\n        {\"how\": \"%s\", \"flags\": \"%s\", \"by_hand\": %s, \"calls\": %zu, \"p50\": %s, \"p99\": %s, \"p999\": %s, "
+    std::printf("%s\n        {\"how\": \"%s\", \"calls\": %zu, \"p50\": %s, \"p99\": %s, \"p999\": %s, "
                 "\"worst\": %s, \"best_p50\": %s, \"best_block\": %s}",
-                &c == &all.front() ? "" : ",", c.entry->how(), c.flags, c.by_hand() ? "true" : "false", c.all.size(),
-                number(r.p50).c_str(), number(r.p99).c_str(), number(r.p999).c_str(), number(r.worst).c_str(),
+                &c == &all.front() ? "" : ",", c.entry->how(), c.all.size(), number(r.p50).c_str(), number(r.p99).c_str(), number(r.p999).c_str(), number(r.worst).c_str(),
                 number(r.best_p50).c_str(), number(r.best_block).c_str());
   }
   std::printf("]}");
@@ -396,8 +342,7 @@ void print_table(const Task& task, double difference, const std::vector<Contesta
   std::printf("%-66s%8s%8s%8s%9s%8s%8s\n", task.name, "p50", "p99", "p99.9", "worst", "block", "ratio");
   for (const Contestant& c : all) {
     const Result& r = c.result;
-    const bool native = std::strstr(c.flags, "native") != nullptr;
-    const std::string who = std::string(&c == &all.front() ? "" : native ? "Pinocchio -march=native: " : "Pinocchio: ") + c.entry->how();
+    const std::string who = std::string(&c == &all.front() ? "" : "Pinocchio: ") + c.entry->how();
     std::printf("  %-64s%8.3f%8.3f%8.3f%9.1f%8.3f%8.2f\n", who.c_str(), r.p50, r.p99, r.p999, r.worst, r.best_block,
                 r.best_block / all.front().result.best_block);
   }

@@ -2,17 +2,18 @@
 //
 // palpate's ExtendedKalman and PayloadFilter rest on JointKalman and BaseFrame. Here they are compiled once more, on
 // rival::JointKalman below: the same equations by Pinocchio's computeABADerivatives and Eigen's fixed-size matrices. All that
-// is not dynamics or matrix algebra is thus the same text, compiled with the rival's flags.
+// is not dynamics or matrix algebra is thus the same text. Measured velocities, which the benchmark has none of, are left out.
 //
 // Other ways were tried and are slower: crba, nonLinearEffects, LLT and computeRNEADerivatives (by 0.7 us); one update by all
 // seven positions instead of seven rank-one updates (by 0.7 us); lazy products; updating the whole covariance instead of a
 // triangle.
-#pragma once
 #include <algorithm>
 #include <cmath>
 #include <memory>
+#include <stdexcept>
 #include <type_traits>
 
+#include "contest.hpp"
 #include "palpate/check.hpp"
 #include "palpate/kalman.hpp"
 #include "palpate/payload.hpp"
@@ -26,9 +27,7 @@ class Frame {
   explicit Frame(const Dynamics& dynamics) : dynamics_(dynamics), pose_(dynamics.last_pose()) {}
   const palpate::Pose<double>& pose() const { return pose_; }
   palpate::JointVector body_torque(int, const palpate::Inertia<double>& body) const {
-    palpate::JointVector out{};
-    Eigen::Map<Vector>(out.data()) = dynamics_.body_torque(body);
-    return out;
+    return rival::out(dynamics_.body_torque(body));
   }
 
  private:
@@ -45,7 +44,9 @@ class JointKalman {
   using Input = typename palpate::JointKalman<max_parameters>::Input;
 
   JointKalman(int, int loads, bool torques, bool encoders)
-      : loads_(loads), torques_(torques), encoders_(encoders), k_(loads + (torques ? N : 0) + (encoders ? N : 0)), dim_(2 * N + k_) {}
+      : loads_(loads), torques_(torques), encoders_(encoders), k_(loads + (torques ? N : 0) + (encoders ? N : 0)), dim_(2 * N + k_) {
+    if (loads > 0 && torques && !encoders) throw std::invalid_argument("the rival's payload filter has no size for dry friction without encoder errors");
+  }
 
   int dim() const { return dim_; }
   double q(int i) const { return x_[u(i)]; }
@@ -100,19 +101,6 @@ class JointKalman {
     with_sizes([&](auto loads, auto torques, auto encoders) { predict<loads, torques, encoders>(arm, in, h, columns); });
   }
 
-  template <std::size_t errors>
-  void propagate(std::array<std::array<double, errors>, static_cast<std::size_t>(max_dim)>& E) const {
-    with_sizes([&](auto loads, auto torques, auto encoders) {
-      constexpr int k = loads + (torques ? N : 0) + (encoders ? N : 0), D = 2 * N + k, A = D - (encoders ? N : 0);
-      using Rows = Eigen::Matrix<double, D, static_cast<int>(errors), Eigen::RowMajor>;
-      Eigen::Map<Rows> e(E[0].data());
-      const Eigen::Map<const Eigen::Matrix<double, A, N, Eigen::RowMajor>> Xt(Xt_.data());
-      const Eigen::Matrix<double, N, static_cast<int>(errors), Eigen::RowMajor> g = Xt.transpose() * e.template topRows<A>();
-      e.template topRows<N>() += h_ * e.template middleRows<N>(N) + ht_.asDiagonal() * g;
-      e.template middleRows<N>(N) += g;
-      for (int p = 0; p < k; ++p) e.row(2 * N + p) *= decay_[u(p)];
-    });
-  }
   void propagate(std::array<double, static_cast<std::size_t>(max_dim)>& e) const {
     with_sizes([&](auto loads, auto torques, auto encoders) {
       constexpr int k = loads + (torques ? N : 0) + (encoders ? N : 0), D = 2 * N + k, A = D - (encoders ? N : 0);
@@ -154,7 +142,7 @@ class JointKalman {
  private:
   static constexpr double least_variance = 1e-16;
 
-  /// The sizes as constants. Filters without parameters of their own and the payload filter have different ones.
+  /// The sizes as constants: those of the benchmark's arms, since each costs a compiler ten seconds.
   template <class F>
   void with_sizes(F&& f) const {
     using std::bool_constant, std::integral_constant;
@@ -163,8 +151,7 @@ class JointKalman {
       else f(integral_constant<int, 0>{}, std::false_type{}, std::false_type{});
     } else {
       const auto with_loads = [&](auto loads) {
-        if (torques_ && encoders_) f(loads, std::true_type{}, std::true_type{});
-        else if (torques_) f(loads, std::true_type{}, std::false_type{});
+        if (torques_) f(loads, std::true_type{}, std::true_type{});
         else if (encoders_) f(loads, std::false_type{}, std::true_type{});
         else f(loads, std::false_type{}, std::false_type{});
       };
@@ -188,10 +175,11 @@ class JointKalman {
     Eigen::Map<Eigen::Matrix<double, D, D>> P(P_.data());
     const Vector v = x.template segment<N>(N), q_m = x.template head<N>() + 0.5 * h * v;
     if constexpr (loads > 0) dynamics_->carry(in.load);
-    const SquareView M = dynamics_->mass_matrix(q_m);
+    const Square M = dynamics_->mass_matrix(q_m);
     Vector given = rival::in(in.tau), slope, armature, theta;
     if constexpr (torques) given += x.template segment<N>(P0 + torque);
-    if (in.load_rest.m != 0.0) given -= dynamics_->bias_torque(in.load_rest, v);
+    if (in.load_rest.m != 0.0 || in.load_rest.mc.x != 0.0 || in.load_rest.mc.y != 0.0 || in.load_rest.mc.z != 0.0)
+      given -= dynamics_->bias_torque(in.load_rest, q_m, v);
     for (int i = 0; i < N; ++i) {
       const palpate::Friction friction = expected_friction(arm, i);
       slope[i] = friction.derivative(v[i]);
@@ -202,15 +190,15 @@ class JointKalman {
     }
     Square by_q, by_dq, Noise;
     const Vector ddq = dynamics_->forward_derivatives(q_m, v, given, armature, by_q, by_dq, Noise);
-    Eigen::Map<Vector>(acceleration_.data()) = ddq;
+    acceleration_ = rival::out(ddq);
     Noise *= h;
     Eigen::Map<Eigen::Matrix<double, A, N, Eigen::RowMajor>> Xt(Xt_.data());
     Xt.template topRows<N>() = h * by_q.transpose();
     Xt.template middleRows<N>(N) = (h * (by_dq + 0.5 * h * by_q) - Noise * slope.asDiagonal()).transpose();
     if constexpr (loads > 0) {
-      Eigen::Matrix<double, N, loads + encoder, Eigen::RowMajor> columns_of_load;
-      columns(Frame(*dynamics_), columns_of_load.data(), loads + encoder);
-      Xt.template middleRows<loads>(P0).noalias() = -(Noise * columns_of_load.template leftCols<loads>()).transpose();
+      Eigen::Matrix<double, N, loads, loads == 1 ? Eigen::ColMajor : Eigen::RowMajor> columns_of_load;
+      columns(Frame(*dynamics_), columns_of_load.data(), loads);
+      Xt.template middleRows<loads>(P0).noalias() = -(Noise * columns_of_load).transpose();
     }
     if constexpr (torques) Xt.template middleRows<N>(P0 + torque) = Noise;
 
@@ -239,7 +227,7 @@ class JointKalman {
       P.col(P0 + p).template head<2 * N>() = decay_[u(p)] * T.row(P0 + p).transpose();
       for (int o = 0; o <= p; ++o) P(P0 + o, P0 + p) *= decay_[u(o)] * decay_[u(p)];
     }
-    const Square S = Noise * VectorView(in.torque_variance.data()).asDiagonal() * Noise;
+    const Square S = Noise * rival::in(in.torque_variance).asDiagonal() * Noise;
     P.template block<N, N>(0, 0) += ht_.asDiagonal() * S * ht_.asDiagonal();
     P.template block<N, N>(0, N) += ht_.asDiagonal() * S;
     P.template block<N, N>(N, N) += S;
@@ -284,7 +272,7 @@ class JointKalman {
 
 }  // namespace rival
 
-// The same text on another heart: these two headers see the rival's classes under palpate's names.
+// The same text on another heart, under other names.
 namespace palpate {
 template <int max_parameters>
 using RivalKalman = rival::JointKalman<max_parameters>;
@@ -292,7 +280,26 @@ using RivalFrame = rival::Frame;
 }  // namespace palpate
 #define JointKalman RivalKalman
 #define BaseFrame RivalFrame
+#define ExtendedKalman RivalExtendedKalman
+#define PayloadFilter RivalPayloadFilter
 #include "palpate/observers/extended_kalman.hpp"
 #include "palpate/payload_filter.hpp"
 #undef JointKalman
 #undef BaseFrame
+#undef ExtendedKalman
+#undef PayloadFilter
+
+/// The filter for a job.
+std::unique_ptr<contest::Entry> rival_filter(const palpate::ArmDescription& arm, contest::Job job) {
+  using contest::Job, contest::Timed;
+  using Kalman = Timed<contest::Observing<palpate::RivalExtendedKalman>>;
+  using Weighing = Timed<contest::Weighing<palpate::RivalPayloadFilter>>;
+  constexpr const char* how = "crba, computeABADerivatives, Eigen";
+  switch (job) {
+    case Job::kalman: return std::make_unique<Kalman>(how, arm, contest::smoother<palpate::ExtendedKalmanConfig>());
+    case Job::kalman_disturbance: return std::make_unique<Kalman>(how, arm, palpate::ExtendedKalmanConfig{});
+    case Job::payload_mass: return std::make_unique<Weighing>(how, arm, contest::weigher<palpate::PayloadFilterConfig>(false));
+    case Job::payload_moment: return std::make_unique<Weighing>(how, arm, contest::weigher<palpate::PayloadFilterConfig>(true));
+    default: return nullptr;
+  }
+}
