@@ -45,7 +45,7 @@ class JointKalman {
 
   JointKalman(int, int loads, bool torques, bool encoders)
       : loads_(loads), torques_(torques), encoders_(encoders), k_(loads + (torques ? N : 0) + (encoders ? N : 0)), dim_(2 * N + k_) {
-    if (loads > 0 && torques && !encoders) throw std::invalid_argument("the rival's payload filter has no size for dry friction without encoder errors");
+    if (loads > 0 && !encoders) throw std::invalid_argument("the rival's payload filter is made for encoders of finite resolution");
   }
 
   int dim() const { return dim_; }
@@ -142,7 +142,7 @@ class JointKalman {
  private:
   static constexpr double least_variance = 1e-16;
 
-  /// The sizes as constants: those of the benchmark's arms, since each costs a compiler ten seconds.
+  /// The sizes as constants: those that the benchmark's arms have.
   template <class F>
   void with_sizes(F&& f) const {
     using std::bool_constant, std::integral_constant;
@@ -152,8 +152,7 @@ class JointKalman {
     } else {
       const auto with_loads = [&](auto loads) {
         if (torques_) f(loads, std::true_type{}, std::true_type{});
-        else if (encoders_) f(loads, std::false_type{}, std::true_type{});
-        else f(loads, std::false_type{}, std::false_type{});
+        else f(loads, std::false_type{}, std::true_type{});
       };
       if (loads_ == 1) with_loads(integral_constant<int, 1>{});
       else with_loads(integral_constant<int, 4>{});

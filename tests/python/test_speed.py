@@ -17,7 +17,7 @@ from palpate.studies import speed
 def contestant(how, time):
     return {
         "how": how, "calls": 1024, "p50": time, "p99": 1.5 * time, "p999": 2 * time,
-        "worst": 90.0, "best_p50": 0.9 * time, "best_block": time,
+        "worst": 90.0, "best_p50": time,
     }  # fmt: skip
 
 
@@ -31,6 +31,7 @@ def report():
                 "what": "momentum observer",
                 "required": {"p50": 1.0, "p999": 3.0, "ratio": 3.0},
                 "disagreement": 1e-13,
+                "sensitivity": 1e-13,
                 "contestants": [
                     contestant("palpate", time),
                     contestant("slow", 3.0),
@@ -41,6 +42,7 @@ def report():
                 "what": "mass matrix",
                 "required": {"p50": None, "p999": None, "ratio": None},
                 "disagreement": 2e-13,
+                "sensitivity": 0.0,
                 "contestants": [contestant("palpate", 0.2), contestant("crba", 0.3)],
             },
         ]
@@ -65,7 +67,7 @@ def test_every_bar_is_judged_by_the_worst_arm_and_the_fastest_rival(report):
 
 def test_what_misses_is_not_ok(report):
     tasks = report["arms"][1]["tasks"]
-    tasks[0]["contestants"][0].update(p50=1.1, best_block=0.6)
+    tasks[0]["contestants"][0].update(p50=1.1, best_p50=0.6)
     tasks[1]["disagreement"] = 1e-8
     rows = speed.timing_rows(report)
     assert [row.ok for row in rows] == [False, True, False, False]
@@ -77,12 +79,22 @@ def test_a_difference_that_is_no_number_is_no_agreement(report):
     assert last.ours == math.inf and last.ok is False
 
 
+def test_a_job_that_rounding_upsets_is_judged_by_rounding(report):
+    report["arms"][0]["tasks"][0].update(disagreement=4e-6, sensitivity=1e-6)
+    firm, loose = speed.timing_rows(report)[-2:]
+    assert firm.ours == 2e-13 and firm.ok and "3 jobs" in firm.note
+    assert loose.ours == pytest.approx(4.0) and loose.ok and "1 jobs" in loose.note
+    for difference, sensitivity in ((2e-5, 1e-6), (None, 1e-6), (None, None)):
+        report["arms"][0]["tasks"][0].update(disagreement=difference, sensitivity=sensitivity)
+        assert speed.timing_rows(report)[-1].ok is False
+
+
 def test_without_the_rival_nothing_is_claimed(report):
     for arm in report["arms"]:
         for task in arm["tasks"]:
             del task["contestants"][1:]
     rows = speed.timing_rows(report)
-    assert [row.ok for row in rows] == [True, True, False, False]
+    assert [row.ok for row in rows] == [True, True, False, False, False]
     for row in rows[2:]:
         assert row.ours == "not measured" and "Pinocchio was not found" in row.note
 
