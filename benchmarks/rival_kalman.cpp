@@ -7,6 +7,9 @@
 // Other ways were tried and are slower: crba, nonLinearEffects, LLT and computeRNEADerivatives (by 0.7 us); one update by all
 // seven positions instead of seven rank-one updates (by 0.7 us); lazy products; updating the whole covariance instead of a
 // triangle.
+//
+// Both sides have the same flags. With -march=native (AVX) the payload filters here gain 15 to 20 % and then beat a palpate
+// without it (7.5 beside 9.2 us, kuka_lbr_iiwa14, m); palpate gains as much and with it on both sides stays ahead (7.2 us).
 #include <algorithm>
 #include <cmath>
 #include <memory>

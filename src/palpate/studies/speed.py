@@ -338,7 +338,8 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
         "and include what else the machine did. Ratios compare the medians of the quietest sixteenth; palpate and "
         "the rival take turns and are compiled with the same flags. A row gives the arm that is worst for it.",
         "The rival has the same observers and filters on Pinocchio's algorithms and Eigen's fixed-size matrices; of "
-        "its ways the fastest counts.",
+        "its ways the fastest counts. Both are built for any x86-64; for the machine's own vector instructions see "
+        "benchmarks/rival_kalman.cpp.",
         f"Load average {load[0]} before and {load[1]} after, taken off the core {report['preempted']} times, "
         f"{'kept to one core' if report['pinned'] else 'free to move between cores'}.",
     ]
