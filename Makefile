@@ -122,12 +122,8 @@ wheel: $(VENV)/.test
 	$(BIN)/python scripts/check_wheel.py dist/*.whl
 
 bench: $(VENV)/.bench
-	@$(BIN)/cmake -S . -B build/bench -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja -DPALPATE_BUILD_TESTS=OFF \
-	  -DPALPATE_BUILD_BENCHMARKS=ON --log-level=WARNING >/dev/null \
-	  -DCMAKE_PREFIX_PATH="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))')/cmeel.prefix"
-	@$(BIN)/cmake --build build/bench -- --quiet
-	@set -e; for program in build/bench/benchmarks/benchmark_*; do [ ! -x $$program ] || $$program; done
-	@set -e; for script in benchmarks/*.py; do [ ! -f $$script ] || $(BIN)/python $$script; done
+	$(BIN)/palpate bench speed --out build/bench/results
+	@set -e; for script in benchmarks/*.py; do $(BIN)/python $$script; done
 
 format: $(VENV)/.test
 	$(PIP_INSTALL) "clang-format>=18"

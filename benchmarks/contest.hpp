@@ -1,7 +1,6 @@
 // What the contestants of speed.cpp have in common: the jobs, the clock, and the loop that times every single call.
 //
-// Each contestant is compiled with flags of its own, so only plain data crosses: this header's inline code exists once
-// per contestant, hidden from the others.
+// Entry is all that speed.cpp sees of the rival, so that Pinocchio's headers are compiled in rival.cpp only.
 #pragma once
 #include <array>
 #include <cstdint>
@@ -16,9 +15,12 @@
 #endif
 
 #include "palpate/arm.hpp"
+#include "palpate/types.hpp"
 
 namespace contest {
 
+using palpate::Arm;
+using palpate::ArmDescription;
 using palpate::JointSample;
 
 enum class Job : int {
@@ -34,8 +36,15 @@ enum class Job : int {
   forward_dynamics,
 };
 
-/// The payload filters' prior of the mass [kg]: given, since palpate would take it from the arm's torque limits.
-inline constexpr double mass_prior_std = 2.0;
+/// Configurations that are not the default, for both sides' classes.
+template <class ExtendedKalmanConfig>
+ExtendedKalmanConfig smoother() {
+  return {.disturbance = false};
+}
+template <class PayloadFilterConfig>
+PayloadFilterConfig weigher(bool first_moment) {
+  return {.first_moment = first_moment, .mass_prior_std = 2.0};
+}
 
 /// What a contestant found for one sample; the contestants must agree.
 struct Numbers {
@@ -46,6 +55,48 @@ struct Numbers {
   void add(const Array& values, int count) {
     for (int i = 0; i < count; ++i) add(values[static_cast<std::size_t>(i)]);
   }
+};
+
+/// An observer with its arm.
+template <class Observer>
+struct Observing {
+  template <class Config>
+  Observing(const ArmDescription& d, const Config& config) : arm(d), observer(arm, config) {}
+  void step(const JointSample& s) { external = observer.step(s); }
+  Numbers numbers() const {
+    Numbers out;
+    out.add(external.torque, arm.n());
+    out.add(external.std, arm.n());
+    if constexpr (requires { observer.positions(); }) {
+      out.add(observer.positions(), arm.n());
+      out.add(observer.velocities(), arm.n());
+    }
+    return out;
+  }
+  Arm arm;
+  Observer observer;
+  palpate::ExternalTorque external{};
+};
+
+/// A payload filter with its arm.
+template <class Filter>
+struct Weighing {
+  template <class Config>
+  Weighing(const ArmDescription& d, const Config& config) : arm(d), filter(arm, config) {}
+  void step(const JointSample& s) { payload = filter.step(s); }
+  Numbers numbers() const {
+    Numbers out;
+    out.add(payload.mass);
+    out.add(payload.mass_std);
+    out.add(payload.first_moment, 3);
+    out.add(payload.first_moment_std, 3);
+    out.add(filter.positions(), arm.n());
+    out.add(filter.velocities(), arm.n());
+    return out;
+  }
+  Arm arm;
+  Filter filter;
+  palpate::Payload payload{};
 };
 
 #if defined(__x86_64__)

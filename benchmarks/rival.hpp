@@ -1,64 +1,59 @@
-// What the rival's files share: the arm in Pinocchio's terms.
+// The rival's dynamics between fixed-size Eigen types: Pinocchio, whose headers are compiled in rival_dynamics.cpp only.
 #pragma once
-#include <pinocchio/algorithm/aba-derivatives.hpp>
-#include <pinocchio/algorithm/aba.hpp>
-#include <pinocchio/algorithm/crba.hpp>
-#include <pinocchio/algorithm/kinematics.hpp>
-#include <pinocchio/algorithm/rnea-derivatives.hpp>
-#include <pinocchio/algorithm/rnea.hpp>
-#include <pinocchio/multibody.hpp>
-#include <stdexcept>
-#include <string>
+#include <Eigen/Dense>
+#include <cstddef>
+#include <memory>
 
-#include "contest.hpp"
+#include "palpate/chain.hpp"
 
 namespace rival {
-
-namespace pin = pinocchio;
-using contest::Numbers;
-using palpate::Arm;
-using palpate::JointSample;
-using palpate::JointVector;
 
 constexpr int N = 7;
 using Vector = Eigen::Matrix<double, N, 1>;
 using Square = Eigen::Matrix<double, N, N>;
 using Factor = Eigen::LLT<Square, Eigen::Upper>;  // crba fills the upper triangle
 
-inline Eigen::Map<const Vector> in(const JointVector& x) { return Eigen::Map<const Vector>(x.data()); }
-inline Eigen::Vector3d vector3(const palpate::Vec3<double>& a) { return {a.x, a.y, a.z}; }
 inline std::size_t u(int i) { return static_cast<std::size_t>(i); }
-
-inline pin::Inertia inertia(const palpate::Inertia<double>& b) {
-  const Eigen::Vector3d c = vector3(b.mc) / b.m;
-  Eigen::Matrix3d I;
-  I << b.I.xx, b.I.xy, b.I.xz, b.I.xy, b.I.yy, b.I.yz, b.I.xz, b.I.yz, b.I.zz;
-  return {b.m, c, I - b.m * (c.squaredNorm() * Eigen::Matrix3d::Identity() - c * c.transpose())};
+inline Eigen::Map<const Vector> in(const palpate::JointVector& x) { return Eigen::Map<const Vector>(x.data()); }
+inline palpate::JointVector out(const Vector& x) {
+  palpate::JointVector values{};
+  Eigen::Map<Vector>(values.data()) = x;
+  return values;
 }
+inline Eigen::Vector3d vector3(const palpate::Vec3<double>& a) { return {a.x, a.y, a.z}; }
 
-inline pin::Model model_of(const Arm& arm) {
-  if (arm.n() != N) throw std::invalid_argument("the rival's matrices are made for 7 joints");
-  pin::Model model;
-  pin::JointIndex parent = 0;
-  for (int j = 0; j < N; ++j) {
-    const palpate::Body& b = arm.body(j);
-    if (b.prismatic) throw std::invalid_argument("the rival is made for revolute joints");
-    Eigen::Matrix3d R;
-    R << vector3(b.R.cx), vector3(b.R.cy), vector3(b.R.cz);
-    parent = model.addJoint(parent, pin::JointModelRZ(), pin::SE3(R, vector3(b.p)), "joint " + std::to_string(j + 1));
-    model.appendBodyToJoint(parent, inertia(b.inertia));
-    model.armature[j] = b.rotor_inertia;
-  }
-  model.gravity.linear() = vector3(arm.gravity());
-  return model;
-}
+/// An arm of seven revolute joints. Each member is Pinocchio's algorithm of the name that is said.
+class Dynamics {
+ public:
+  explicit Dynamics(const palpate::Arm& arm);
+  ~Dynamics();
 
-/// Everything a job needs of the arm.
-struct Rival {
-  explicit Rival(const palpate::ArmDescription& description) : arm(description), model(model_of(arm)), data(model) {}
-  Arm arm;
-  pin::Model model;
-  pin::Data data;
+  Vector inverse(const Vector& q, const Vector& dq, const Vector& ddq);  ///< rnea
+  Vector bias(const Vector& q, const Vector& dq);                        ///< nonLinearEffects
+  Vector forward(const Vector& q, const Vector& dq, const Vector& tau);  ///< aba
+  Square mass_matrix(const Vector& q);                                   ///< crba; the upper triangle
+
+  /// p, C^T q' and g from computeGeneralizedGravity, rnea at q'' = q' (cheaper than crba and a product), computeCoriolisMatrix.
+  void momentum_terms(const Vector& q, const Vector& dq, Vector& p, Vector& Ct_dq, Vector& g);
+  /// The same from computeCoriolisMatrix alone: it leaves the joint axes J and, in Ag, the momentum of the bodies beyond each
+  /// joint per unit of its speed.
+  void momentum_terms_from_coriolis(const Vector& q, const Vector& dq, Vector& p, Vector& Ct_dq, Vector& g);
+
+  /// computeABADerivatives with `armature` beside the rotors': q'' and its derivatives.
+  Vector forward_derivatives(const Vector& q, const Vector& dq, const Vector& tau, const Vector& armature, Square& by_q, Square& by_dq,
+                             Square& inverse_inertia);
+  /// The body on the last link from now on, about the link's origin.
+  void carry(const palpate::Inertia<double>& load);
+  /// Joint torques of a body on the last link at q'' = 0; about the link's origin.
+  Vector bias_torque(const palpate::Inertia<double>& body, const Vector& q, const Vector& dq);
+  /// Joint torques of a body on the last link, at the last forward_derivatives(); base axes, about the base origin.
+  Vector body_torque(const palpate::Inertia<double>& body) const;
+  /// Placement of the last link, at the last forward_derivatives(); the joints' axes and origins are left out.
+  palpate::Pose<double> last_pose() const;
+
+ private:
+  struct Pinocchio;
+  std::unique_ptr<Pinocchio> p_;
 };
 
 }  // namespace rival
