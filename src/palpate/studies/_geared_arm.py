@@ -13,7 +13,7 @@ C. Canudas de Wit, H. Olsson, K. Astrom, P. Lischinsky, IEEE TAC 40(3), 1995. Wh
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,62 +75,92 @@ class Motion:
         return len(self.time)
 
 
-def simulate(arm: Arm, drives: Drives, reference: Callable[[Array], Array], seconds: float, wrench: Array | None = None) -> Motion:
-    """Let the arm follow a reference.
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One motion to simulate.
 
-    Args:
+    Attributes:
         arm: links and gravity; its friction and rotor inertias are not used.
         drives: the motors.
-        reference: times (N,) [s] to joint positions (N, n) [rad].
+        reference: times (N,) [s] to joint positions (N, n) [rad]; stays where it is after its end.
         seconds: how long.
-        wrench: (N, 6) on the tip, base axes [N, N m]; None: nothing pushes.
+        wrench: times (N,) [s] to the wrench on the tip (N, 6), base axes [N, N m]; None: nothing pushes.
     """
-    count = round(seconds * RATE)
-    h = 1.0 / RATE
+
+    arm: Arm
+    drives: Drives
+    reference: Callable[[Array], Array]
+    seconds: float
+    wrench: Callable[[Array], Array] | None = None
+
+
+def simulate(runs: Sequence[Run], progress: Callable[[float], None] = lambda done: None) -> list[Motion]:
+    """Let arms with the same transmission follow their references, all at once.
+
+    Args:
+        runs: what to simulate.
+        progress: told the part that is done, now and then.
+    """
+    h, dt = 1.0 / RATE, 1.0 / RATE / SUBSTEPS
+    count = round(max(run.seconds for run in runs) * RATE)
     time = np.arange(count + 1) * h
-    q_d = reference(time)
+    K, n = len(runs), runs[0].arm.n
+    B, inverse_B = runs[0].drives.B, np.linalg.inv(runs[0].drives.B)
+
+    def of_drives(name: str) -> Array:
+        return np.array([getattr(run.drives, name) for run in runs])
+
+    coulomb, static, viscous = of_drives("coulomb"), of_drives("static"), of_drives("viscous")
+    stribeck, presliding = of_drives("stribeck_velocity"), of_drives("presliding")
+    ripple, wave = of_drives("ripple"), 2.0 * np.pi / of_drives("ripple_period")
+    rotors = np.array([B.T @ np.diag(run.drives.inertia) @ B for run in runs])
+    q_d = np.stack([run.reference(time) for run in runs], axis=1)
     dq_d = np.gradient(q_d, h, axis=0)
     ddq_d = np.gradient(dq_d, h, axis=0)
-    F = np.zeros((count + 1, 6)) if wrench is None else wrench
-    core, n, tip = arm.core, arm.n, np.zeros(3)
-    B, BT = drives.B, drives.B.T.copy()
-    rotors = BT @ np.diag(drives.inertia) @ B
-    feedforward = arm.inverse_dynamics(q_d, dq_d, ddq_d) @ np.linalg.inv(B)
-    # inertia each motor sees in the middle of the motion sets its gains
-    M = arm.mass_matrix(q_d[count // 2]) + rotors
-    seen = np.diag(np.linalg.inv(B).T @ M @ np.linalg.inv(B))
+    F = np.stack([np.zeros((count + 1, 6)) if run.wrench is None else run.wrench(time) for run in runs], axis=1)
+    arms = list({id(run.arm): run.arm for run in runs}.values())
+    groups = [(arm, [k for k, run in enumerate(runs) if run.arm is arm]) for arm in arms]
+    feedforward, seen = np.empty((count + 1, K, n)), np.empty((K, n))
+    for k, run in enumerate(runs):
+        feedforward[:, k] = run.arm.inverse_dynamics(q_d[:, k], dq_d[:, k], ddq_d[:, k]) @ inverse_B
+        # the inertia each motor sees in the middle of the motion sets its gains
+        seen[k] = np.diag(inverse_B.T @ (run.arm.mass_matrix(q_d[count // 2, k]) + rotors[k]) @ inverse_B)
     # the speed loop must outdo the falling branch of the Stribeck curve, or the joint creeps by jerks
-    falling = (drives.static - drives.coulomb) / drives.stribeck_velocity
-    kp, kd = seen * BANDWIDTH**2, 2.0 * seen * BANDWIDTH + 1.5 * falling
+    kp, kd = seen * BANDWIDTH**2, 2.0 * seen * BANDWIDTH + 1.5 * (static - coulomb) / stribeck
     ki = kp * BANDWIDTH / 4.0
-    stiffness = drives.coulomb / drives.presliding
+    stiffness = coulomb / presliding
     micro = 0.2 * np.sqrt(stiffness * seen)
-    q, dq = q_d[0].copy(), np.zeros(n)
-    z = np.zeros(n)
-    integral = np.zeros(n)
-    friction = np.zeros(n)
-    rows_q, rows_dq = np.empty((count, n)), np.empty((count, n))
-    rows_tau, rows_f = np.empty((count, n)), np.empty((count, n))
-    zero = np.zeros((1, n))
-    dt = h / SUBSTEPS
+    q, dq, z = q_d[0].copy(), np.zeros((K, n)), np.zeros((K, n))
+    integral, friction = np.zeros((K, n)), np.zeros((K, n))
+    rows = np.empty((4, count, K, n))
+    M, push, zero, tip = np.empty((K, n, n)), np.empty((K, n)), np.zeros((K, n)), np.zeros(3)
+    BT = B.T.copy()
     for k in range(count):
-        error = B @ (q_d[k] - q)
+        error = (q_d[k] - q) @ BT
         integral += error * h
-        tau = feedforward[k] + kp * error + kd * (B @ (dq_d[k] - dq)) + ki * integral
-        here = q[None]
-        inverse = np.linalg.inv(core.mass_matrix(here)[0] + rotors)
-        push = core.jacobian(here, tip)[0].T @ F[k] - core.inverse_dynamics(here, dq[None], zero)[0]
-        ripple = 1.0 + drives.ripple * np.sin(2.0 * np.pi * (B @ q) / drives.ripple_period)
-        rows_q[k], rows_dq[k] = q, dq
+        tau = feedforward[k] + kp * error + kd * ((dq_d[k] - dq) @ BT) + ki * integral
+        for arm, at in groups:
+            core, here = arm.core, q[at]
+            M[at] = core.mass_matrix(here)
+            J = core.jacobian(here, tip)
+            push[at] = np.einsum("kij,ki->kj", J, F[k, at]) - core.inverse_dynamics(here, dq[at], zero[at])
+        inverse = np.linalg.inv(M + rotors)
+        uneven = 1.0 + ripple * np.sin(wave * (q @ BT))
+        rows[0, k], rows[1, k] = q, dq
         for _ in range(SUBSTEPS):
-            w = B @ dq
-            g = drives.coulomb + (drives.static - drives.coulomb) * np.exp(-np.square(w / drives.stribeck_velocity))
-            reach = drives.presliding * g / drives.coulomb
+            w = dq @ BT
+            g = coulomb + (static - coulomb) * np.exp(-np.square(w / stribeck))
+            reach = presliding * g / coulomb
             end = np.sign(w) * reach
             moved = end + (z - end) * np.exp(-np.abs(w) * dt / reach)
-            friction = ripple * (stiffness * moved + micro * (moved - z) / dt) + drives.viscous * w
+            friction = uneven * (stiffness * moved + micro * (moved - z) / dt) + viscous * w
             z = moved
-            dq = dq + dt * (inverse @ (BT @ (tau - friction) + push))
+            dq = dq + dt * (inverse @ ((tau - friction) @ B + push)[:, :, None])[:, :, 0]
             q = q + dt * dq
-        rows_tau[k], rows_f[k] = tau, friction
-    return Motion(time[:count], rows_q, rows_dq, rows_tau, rows_f, F[:count])
+        rows[2, k], rows[3, k] = tau, friction
+        if k % 1000 == 999:
+            progress((k + 1) / count)
+    return [
+        Motion(time[:length], *rows[:, :length, k], F[:length, k])
+        for k, length in enumerate(round(run.seconds * RATE) for run in runs)
+    ]
