@@ -68,7 +68,7 @@ nb::dict run(PyPhaseCurrents& p, const Times& time, const Rows& phase_a, const R
 void bind_phase(nb::module_& m) {
   nb::class_<PyPhaseCurrents>(m, "PhaseCurrents", "tau = k_t G I with sign from two phase currents per joint; see palpate.PhaseCurrents.")
       .def("__init__", [](PyPhaseCurrents* self, const Vector& k_t, const Vector& gear, const Vector& pole_pairs, const Vector& angle_offset, const Rows& offset,
-                          const Rows& gain, const Vector& amplitude_std, double direct_share, double settle_time, double flip_rate, const Vector& model_std, double model_time, bool published) {
+                          const Rows& gain, const Vector& amplitude_std, double direct_share, double current_rate, double settle_time, double flip_rate, const Vector& model_std, double model_time, bool published) {
         const std::size_t n = k_t.shape(0);
         expect(n >= 1 && n <= static_cast<std::size_t>(max_joints), "PhaseCurrents: 1 to 16 joints");
         const double *G = column(gear, n, "gear"), *poles = column(pole_pairs, n, "pole_pairs"), *angle = column(angle_offset, n, "angle_offset");
@@ -77,7 +77,8 @@ void bind_phase(nb::module_& m) {
         PyPhaseCurrents out;
         for (std::size_t j = 0; j < n; ++j) {
           out.drives.emplace_back(PhaseCurrentConfig{.torque_constant = k_t.data()[j], .gear = G[j], .pole_pairs = static_cast<int>(poles[j]),
-                                                     .angle_offset = angle[j], .amplitude_std = noise[j], .direct_share = direct_share, .settle_time = settle_time, .flip_rate = flip_rate,
+                                                     .angle_offset = angle[j], .amplitude_std = noise[j],
+                                                     .direct_share = direct_share, .current_rate = current_rate, .settle_time = settle_time, .flip_rate = flip_rate,
                                                      .model_std = model[j], .model_time = model_time, .published = published});
           PhaseCalibration sensor;
           sensor.offset = {zero[2 * j], zero[2 * j + 1]};
@@ -86,7 +87,7 @@ void bind_phase(nb::module_& m) {
         }
         new (self) PyPhaseCurrents(std::move(out));
       }, nb::kw_only(), nb::arg("k_t"), nb::arg("gear"), nb::arg("pole_pairs"), nb::arg("angle_offset"), nb::arg("offset"), nb::arg("gain"), nb::arg("amplitude_std"),
-           nb::arg("direct_share"), nb::arg("settle_time"), nb::arg("flip_rate"), nb::arg("model_std"), nb::arg("model_time"), nb::arg("published"))
+           nb::arg("direct_share"), nb::arg("current_rate"), nb::arg("settle_time"), nb::arg("flip_rate"), nb::arg("model_std"), nb::arg("model_time"), nb::arg("published"))
       .def("run", &run, nb::arg("time_ns"), nb::arg("phase_a"), nb::arg("phase_b"), nb::arg("position").none() = nb::none(),
            nb::arg("controller_current").none() = nb::none(), nb::arg("model_torque").none() = nb::none(), "Rows of all joints; continues from the rows before.")
       .def("reset", [](PyPhaseCurrents& self) {

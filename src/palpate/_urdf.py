@@ -884,8 +884,8 @@ def _extra_lines(arm: Arm) -> list[str]:
             f'    <effort kind="current" k_t="{_words(arm.effort.k_t)}" gear="{_words(arm.effort.gear)}"/>'
         )
     elif arm.effort.kind == "phase_currents":
-        keys = ("k_t", "gear", "pole_pairs", "angle_offset")
-        words = " ".join(f'{key}="{_words(getattr(arm.effort, key))}"' for key in keys)
+        names = ("k_t", "gear", "pole_pairs", "angle_offset")
+        words = " ".join(f'{name}="{_words(getattr(arm.effort, name))}"' for name in names)
         lines.append(f'    <effort kind="phase_currents" {words}/>')
     elif arm.effort.kind == "torque":
         lines.append('    <effort kind="torque"/>')

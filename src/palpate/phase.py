@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,9 +30,10 @@ class PhaseTorque:
         torque: (N, n) of the motors at the link side [N m].
         current: (N, n) signed peak current [A].
         sign_probability: (N, n) that the sign is right [1].
-        source: (N, n) uint8, where the sign is from: 0 electrical angle, 1 controller current, 2 model torque, 3 published.
-        status: (N, n) uint8, palpate.Status: ``ok``; ``held`` while the readings are no sine (the last good torque is repeated);
-            ``warming`` while the sign is not known; ``non_finite``.
+        source: (N, n) uint8, where the sign is from: 0 electrical angle, 1 controller current, 2 model torque,
+            3 published.
+        status: (N, n) uint8, palpate.Status: ``ok``; ``held`` while the readings are no sine (the last good
+            torque is repeated); ``warming`` while the sign is not known; ``non_finite``.
     """
 
     torque: Array
@@ -44,9 +46,10 @@ class PhaseTorque:
 class PhaseCurrents:
     """tau = k_t G I with its sign, from two phase currents per motor: I = (2/sqrt 3) sqrt(i_a^2 + i_a i_b + i_b^2).
 
-    The sign is taken from the electrical angle (Park's transformation) where `pole_pairs` and the position are known, else
-    from the controller's current, else from a filter on the torque that a model asks for. With the electrical angle, readings
-    that are no sine (the change of the phase order at a reversal) show as a d-axis current and are ``held``.
+    The sign is taken from the electrical angle (Park's transformation) where `pole_pairs` and the position are
+    known, else from the controller's current, else from a filter on the torque that a model asks for. With the
+    electrical angle, readings that are no sine (the change of the phase order at a reversal) show as a d-axis
+    current and are ``held``.
 
     Args:
         n: number of motors.
@@ -57,7 +60,9 @@ class PhaseCurrents:
         offset, gain: (n, 2) of the sensors a and b, see :func:`palpate.identify.calibrate_phases` [A, 1].
         amplitude_std: noise of the amplitude [A].
         direct_share: largest d-axis current that is believed, part of the amplitude [1].
-        settle_time: after a d-axis current that was not believed, readings count again so much later [s].
+        current_rate: fastest change of the torque-making current that is believed, beside noise [A/s];
+            infinite: any.
+        settle_time: after readings that were not believed, they count again so much later [s].
         flip_rate: sign changes to be expected near zero torque [1/s].
         model_std: error of the model torque that tells the sign [N m].
         model_time: how long such an error lasts [s].
@@ -79,6 +84,7 @@ class PhaseCurrents:
         gain: npt.ArrayLike = 1.0,
         amplitude_std: Numbers = 0.05,
         direct_share: float = 0.2,
+        current_rate: float = math.inf,
         settle_time: float = 0.02,
         flip_rate: float = 5.0,
         model_std: Numbers = 1.0,
@@ -96,6 +102,7 @@ class PhaseCurrents:
                 gain=np.array(np.broadcast_to(np.asarray(gain, dtype=np.float64), (n, 2))),
                 amplitude_std=_each(amplitude_std, n),
                 direct_share=float(direct_share),
+                current_rate=float(current_rate),
                 settle_time=float(settle_time),
                 flip_rate=float(flip_rate),
                 model_std=_each(model_std, n),
@@ -164,7 +171,8 @@ class PhaseCurrents:
         return PhaseTorque(**found)
 
     def step(self, sample: Sample) -> Array:
-        """(n,) torque [N m] of one sample whose effort is (n, 2), the readings of both phases [A]; NaN while it is not known.
+        """(n,) torque [N m] of one sample whose effort is (n, 2), the readings of both phases [A]; NaN while
+        it is not known.
 
         Raises:
             InputError: the effort has another shape.
@@ -172,7 +180,8 @@ class PhaseCurrents:
         readings = np.asarray(sample.effort, dtype=np.float64)
         if readings.shape != (self.n, 2):
             raise InputError(
-                f"phase currents: the sample's effort must be ({self.n}, 2), two phases per motor, got {readings.shape}"
+                f"phase currents: the sample's effort must be ({self.n}, 2), two phases per motor, got "
+                f"{readings.shape}"
             )
         model = None if sample.model_torque is None else sample.model_torque[None]
         found = self.run(
@@ -197,9 +206,7 @@ class PhaseCurrents:
         readings = []
         for name in (PHASE_A, PHASE_B):
             if name not in log.signals:
-                raise InputError(
-                    f"the log has no signal {name!r}; it has {', '.join(log.signals) or 'none'}"
-                )
+                raise InputError(f"the log has no signal {name!r}; it has {', '.join(log.signals) or 'none'}")
             signal = log.signals[name]
             if signal.value.shape != log.position.shape or not np.array_equal(signal.time_ns, log.time_ns):
                 raise InputError(
@@ -228,4 +235,8 @@ def _known(status: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
 
 
 def _each(value: Numbers, n: int) -> Array:
-    return np.array(np.broadcast_to(np.asarray(value if isinstance(value, int | float) else list(value), dtype=np.float64), (n,)))
+    return np.array(
+        np.broadcast_to(
+            np.asarray(value if isinstance(value, int | float) else list(value), dtype=np.float64), (n,)
+        )
+    )

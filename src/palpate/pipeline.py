@@ -279,9 +279,7 @@ class Pipeline:
         """
         try:
             effort = sample.effort if self._phases is None else self._phases.step(sample)
-            t = self._core.step(
-                sample.time_ns, sample.position, sample.velocity, effort, sample.model_torque
-            )
+            t = self._core.step(sample.time_ns, sample.position, sample.velocity, effort, sample.model_torque)
         except (ValueError, TypeError) as e:
             raise InputError(f"sample: {str(e).splitlines()[0]}") from None
         return Touch(

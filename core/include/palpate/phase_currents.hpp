@@ -54,6 +54,7 @@ struct PhaseCurrentConfig {
   double angle_offset = 0.0;       ///< electrical angle at joint position 0 [rad]
   double amplitude_std = 0.05;     ///< noise of the amplitude [A]
   double direct_share = 0.2;       ///< largest i_d that is believed beside 4 amplitude_std, part of the amplitude [1]
+  double current_rate = std::numeric_limits<double>::infinity();  ///< fastest change of i_q that is believed, beside noise [A/s]
   double settle_time = 0.02;       ///< after an i_d that was not believed, readings count again so much later [s]
   double flip_rate = 5.0;          ///< sign changes to be expected near zero torque [1/s]
   double model_std = 1.0;          ///< error of the model torque that tells the sign, external torque included, at the link [N m]
@@ -79,8 +80,9 @@ struct PhaseHints {
 /// outdoes the model for a moment does not turn the torque over.
 ///
 /// Where a motor turns back, the change of the phase order leaves a wave for some tens of milliseconds that is no sine, and whose
-/// amplitude is not the torque's. With the electrical angle known it shows as a d-axis current: then the last good torque is
-/// repeated, as `held`.
+/// amplitude is not the torque's. With the electrical angle known it shows as a d-axis current, or, where the field happens to
+/// stand so that the wave lies on the q axis, as a current that changes faster than the drive's does (current_rate): then the
+/// last good torque is repeated, as `held`.
 class PhaseTorque {
  public:
   explicit PhaseTorque(const PhaseCurrentConfig& config) : config_(config) {
@@ -90,6 +92,7 @@ class PhaseTorque {
     check::finite("PhaseCurrentConfig angle_offset [rad]", config.angle_offset);
     check::positive("PhaseCurrentConfig amplitude_std [A]", config.amplitude_std);
     check::positive("PhaseCurrentConfig direct_share [1]", config.direct_share);
+    if (!(config.current_rate > 0.0)) check::fail("PhaseCurrentConfig current_rate [A/s]", config.current_rate, "a positive number, infinity for none");
     check::not_negative("PhaseCurrentConfig settle_time [s]", config.settle_time);
     check::positive("PhaseCurrentConfig flip_rate [1/s]", config.flip_rate);
     check::positive("PhaseCurrentConfig model_std [N m]", config.model_std);
@@ -116,14 +119,18 @@ class PhaseTorque {
     if (config_.pole_pairs > 0 && std::isfinite(hints.position)) {
       const double theta_e = config_.pole_pairs * config_.gear * hints.position + config_.angle_offset;
       const double i_d = direct_current(i_a, i_b, theta_e);
-      const bool no_sine = std::abs(i_d) > 4.0 * config_.amplitude_std + config_.direct_share * phase_amplitude(i_a, i_b);
+      const double i_q = quadrature_current(i_a, i_b, theta_e);
+      age_ += dt;
+      const bool jump = known_ && std::abs(i_q - good_) > 6.0 * config_.amplitude_std + config_.current_rate * age_;
+      const bool no_sine = jump || std::abs(i_d) > 4.0 * config_.amplitude_std + config_.direct_share * phase_amplitude(i_a, i_b);
       settling_ = no_sine ? config_.settle_time : settling_ - dt;  // such a wave may pass the q axis on its way
       if (no_sine || settling_ > 0.0) {
         out = finish(good_, 1.0, CurrentSign::electrical_angle);
         out.status = known_ ? Status::held : Status::warming;
         return out;
       }
-      good_ = quadrature_current(i_a, i_b, theta_e);
+      good_ = i_q;
+      age_ = 0.0;
       known_ = true;
       return finish(good_, 1.0, CurrentSign::electrical_angle);
     }
@@ -140,7 +147,7 @@ class PhaseTorque {
   }
 
   void reset() noexcept {
-    odds_ = good_ = settling_ = 0.0;
+    odds_ = good_ = age_ = settling_ = 0.0;
     known_ = false;
   }
 
@@ -171,6 +178,7 @@ class PhaseTorque {
   PhaseCurrentConfig config_;
   double odds_ = 0.0;   // log of P(plus)/P(minus)
   double good_ = 0.0;   // newest i_q that was believed [A]
+  double age_ = 0.0;    // how old it is [s]
   double settling_ = 0.0;  // until readings count again [s]
   bool known_ = false;  // there was a good i_q
 };

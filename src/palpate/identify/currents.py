@@ -1,7 +1,8 @@
 """From two phase currents per motor to torque: sensors, electrical angle, torque constants (MATH.md section 7).
 
-Two things no data sheet tells are found from logs: what the current sensors read at zero, how their gains differ and where the
-rotor's field stands (:func:`calibrate_phases`), and what an ampere is worth at the joint (:func:`fit_torque_constants`).
+Two things no data sheet tells are found from logs: what the current sensors read at zero, how their gains
+differ and where the rotor's field stands (:func:`calibrate_phases`), and what an ampere is worth at the joint
+(:func:`fit_torque_constants`).
 """
 
 from __future__ import annotations
@@ -53,14 +54,16 @@ def calibrate_phases(
 ) -> PhaseCalibration:
     """Sensors and electrical angle of one motor from a motion in both directions, whatever the torque does.
 
-    A field-oriented drive keeps the d-axis current at zero. So for true currents and the true angle theta = turns q + offset
+    A field-oriented drive keeps the d-axis current at zero. So for true currents and the true angle theta =
+    turns q + offset
 
         i_d = i_a cos theta + (i_a + 2 i_b)/sqrt 3 sin theta = 0
 
-    at every instant: offsets, the ratio of the gains and the angle are those that make it so, by least squares of i_d over its own
-    noise, with Huber's loss for the instants at which the wave is no sine. That leaves the angle open by half a turn, and energy tells
-    which half: over a motion that comes back to where it began friction takes work, so the integral of i_q dq is positive (for a
-    positive torque constant and gear).
+    at every instant: offsets, the ratio of the gains and the angle are those that make it so, by least squares
+    of i_d over its own noise, with Huber's loss for the instants at which the wave is no sine. That leaves the
+    angle open by half a turn, and energy tells
+    which half: over a motion that comes back to where it began friction takes work, so the integral of i_q dq
+    is positive (for a positive torque constant and gear).
 
     Args:
         position: (N,) of the motor at the link side [rad]; ends near its beginning.
@@ -78,22 +81,28 @@ def calibrate_phases(
         raise MissingExtraError("identify", "identification") from None
     q, a, b = (np.asarray(x, dtype=np.float64) for x in (position, phase_a, phase_b))
     if q.ndim != 1 or q.shape != a.shape or q.shape != b.shape:
-        raise InputError(f"position, phase_a, phase_b must have one shape (N,), got {q.shape}, {a.shape}, {b.shape}")
+        raise InputError(
+            f"position, phase_a, phase_b must have one shape (N,), got {q.shape}, {a.shape}, {b.shape}"
+        )
     finite = np.isfinite(q) & np.isfinite(a) & np.isfinite(b)
     q, a, b = q[finite], a[finite], b[finite]
     if len(q) < 100 or not np.ptp(q) * abs(turns) > 4.0 * math.pi:
         seen = np.ptp(q) * abs(turns) / (2.0 * math.pi) if len(q) else 0.0
         raise InputError(
-            f"phase currents are calibrated by a motion of at least two electrical turns and 100 readings, got {seen:.2g} turns, "
+            "phase currents are calibrated by a motion of at least two electrical turns and 100 readings, "
+            f"got {seen:.2g} turns, "
             f"{len(q)} readings"
         )
     # a current vector j i_q e^{j theta}: squared, the sign of i_q is gone; the offsets' mean over the turns is zero
-    squared = np.square((a - a.mean() + 1j * (a - a.mean() + 2.0 * (b - b.mean())) / math.sqrt(3.0)) * np.exp(-1j * turns * q))
+    squared = np.square(
+        (a - a.mean() + 1j * (a - a.mean() + 2.0 * (b - b.mean())) / math.sqrt(3.0)) * np.exp(-1j * turns * q)
+    )
     total = squared.sum()
     agreement = float(abs(total) / np.abs(squared).sum())
     if agreement < LEAST_AGREEMENT:
         raise InputError(
-            f"the phase currents do not follow the position at {turns:g} electrical turns per turn (agreement {agreement:.2f}): "
+            f"the phase currents do not follow the position at {turns:g} electrical turns per turn "
+            f"(agreement {agreement:.2f}): "
             "check pole pairs, gear ratio and its sign, and that phase b lags phase a"
         )
     start = np.array([float(a.mean()), float(b.mean()), 0.0, 0.5 * float(np.angle(-total))])
@@ -110,13 +119,16 @@ def calibrate_phases(
         direct, size = scaled(p)
         return direct / size
 
-    for robust in (True, True, False):
-        if not robust:  # what is no sine pulls to one side even where it counts little
-            sine = np.abs(residual(start)) < CLEAN * noise
-            q, a, b = q[sine], a[sine], b[sine]
-        noise = max(1.4826 * float(np.median(np.abs(residual(start)))), 1e-12)
-        solved = least_squares(residual, start, loss="huber" if robust else "linear", f_scale=2.0 * noise)
-        start = solved.x
+    def spread(p: Array) -> float:
+        return max(1.4826 * float(np.median(np.abs(residual(p)))), 1e-12)
+
+    for _ in range(2):
+        start = least_squares(residual, start, loss="huber", f_scale=2.0 * spread(start)).x
+    # what is no sine pulls to one side even where it counts little
+    sine = np.abs(residual(start)) < CLEAN * spread(start)
+    q, a, b = q[sine], a[sine], b[sine]
+    solved = least_squares(residual, start)
+    noise = spread(solved.x)
     offset_a, offset_b, log_ratio, angle = (float(x) for x in solved.x)
     std = noise * np.sqrt(np.diag(np.linalg.inv(solved.jac.T @ solved.jac)))
     x, y = math.exp(-0.5 * log_ratio) * (a - offset_a), math.exp(0.5 * log_ratio) * (b - offset_b)
@@ -178,7 +190,9 @@ def fit_torque_constants(
     """
     tau, i, s = (np.atleast_2d(np.asarray(x, dtype=np.float64)) for x in (torque, current, approach))
     if not tau.shape == i.shape == s.shape:
-        raise InputError(f"torque, current, approach must have one shape (P, n), got {tau.shape}, {i.shape}, {s.shape}")
+        raise InputError(
+            f"torque, current, approach must have one shape (P, n), got {tau.shape}, {i.shape}, {s.shape}"
+        )
     if not (np.isfinite(tau).all() and np.isfinite(i).all()):
         raise InputError("torque and current of the poses must be finite")
     count, n = tau.shape

@@ -190,11 +190,12 @@ class Fit:
             period: [s].
 
         Returns:
-            (N, n) motor torque at the link side, friction included [N m], and (N, n) the remembered sign z of friction in
-            [-1, 1]: between the ends, where it turns over, friction is known less well.
+            (N, n) motor torque at the link side, friction included [N m], and (N, n) the remembered sign z of
+            friction in [-1, 1]: between the ends, where it turns over, friction is known less well.
         """
         n = self.start.n
-        motion = Segment(np.arange(len(q)) * period, q, dq, ddq, np.zeros_like(q), 1.0 / period, 0)
+        time = np.arange(len(q), dtype=np.float64) * period
+        motion = Segment(time, q, dq, ddq, np.zeros_like(q), 1.0 / period, 0)
         B = np.eye(n) if self.transmission is None else self.transmission
         rigid = self.start.regressor(q, dq, ddq) @ self.phi[: 10 * n] @ np.linalg.inv(B)
         motor = replace(motion, dq=dq @ B.T, ddq=ddq @ B.T)

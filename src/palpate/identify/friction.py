@@ -55,11 +55,12 @@ class FrictionModel:
         presliding: distances x_0 tried [rad]; one value fixes it.
         velocities: Stribeck velocities v_s tried, as parts of the joint's fastest speed [1].
         couplings: drives that turn with several joints.
-        memory: the Stribeck term, too, follows the speed only over the distance x_0, as in the LuGre model, instead of at
-            once.
-        stiction: how unknown friction at rest is, part of its range +-F_c [1]. 1: all of it, rows at rest say next to
-            nothing. Near 0: a joint keeps the friction it stopped with, so rows at rest show how friction rises there;
-            for joints that a stiff controller holds without creep. Held-out residuals tell which is right.
+        memory: the Stribeck term, too, follows the speed only over the distance x_0, as in the LuGre model,
+            instead of at once.
+        stiction: how unknown friction at rest is, part of its range +-F_c [1]. 1: all of it, rows at rest say
+            next to nothing. Near 0: a joint keeps the friction it stopped with, so rows at rest show how
+            friction rises there; for joints that a stiff controller holds without creep. Held-out residuals
+            tell which is right.
     """
 
     stribeck: bool = False

@@ -1,14 +1,15 @@
 """A stiffly controlled industrial arm with geared drives: truth for the sensorless-force study.
 
-Forward dynamics of the chain with friction that sticks, slides and remembers (LuGre), at the motors, which may turn with
+Forward dynamics of the chain with friction that sticks, slides and remembers (LuGre), at the motors, which may
+turn with
 several joints:
 
     M q'' + C q' + g + B^T (I_m B q'' + f) = B^T tau_m + J^T F,        motor speeds w = B q'
     dz/dt = w - |w| z / x(w),   x = x_0 g(w)/F_c,   g = F_c + (F_s - F_c) exp(-(w/v_s)^2)
     f = (F_c/x_0) z + s_1 dz/dt + F_v w
 
-C. Canudas de Wit, H. Olsson, K. Astrom, P. Lischinsky, IEEE TAC 40(3), 1995. What identification fits is another model
-(Dahl's remembered sign times a Stribeck curve), so no fit can be exact.
+C. Canudas de Wit, H. Olsson, K. Astrom, P. Lischinsky, IEEE TAC 40(3), 1995. What identification fits is
+another model (Dahl's remembered sign times a Stribeck curve), so no fit can be exact.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def simulate(runs: Sequence[Run], progress: Callable[[float], None] = lambda don
     """
     h, dt = 1.0 / RATE, 1.0 / RATE / SUBSTEPS
     count = round(max(run.seconds for run in runs) * RATE)
-    time = np.arange(count + 1) * h
+    time = np.arange(count + 1, dtype=np.float64) * h
     K, n = len(runs), runs[0].arm.n
     B, inverse_B = runs[0].drives.B, np.linalg.inv(runs[0].drives.B)
 
@@ -117,7 +118,9 @@ def simulate(runs: Sequence[Run], progress: Callable[[float], None] = lambda don
     q_d = np.stack([run.reference(time) for run in runs], axis=1)
     dq_d = np.gradient(q_d, h, axis=0)
     ddq_d = np.gradient(dq_d, h, axis=0)
-    F = np.stack([np.zeros((count + 1, 6)) if run.wrench is None else run.wrench(time) for run in runs], axis=1)
+    F = np.stack(
+        [np.zeros((count + 1, 6)) if run.wrench is None else run.wrench(time) for run in runs], axis=1
+    )
     arms = list({id(run.arm): run.arm for run in runs}.values())
     groups = [(arm, [k for k, run in enumerate(runs) if run.arm is arm]) for arm in arms]
     feedforward, seen = np.empty((count + 1, K, n)), np.empty((K, n))
@@ -160,7 +163,8 @@ def simulate(runs: Sequence[Run], progress: Callable[[float], None] = lambda don
         rows[2, k], rows[3, k] = tau, friction
         if k % 1000 == 999:
             progress((k + 1) / count)
-    return [
-        Motion(time[:length], *rows[:, :length, k], F[:length, k])
-        for k, length in enumerate(round(run.seconds * RATE) for run in runs)
-    ]
+    motions = []
+    for k, run in enumerate(runs):
+        q_k, dq_k, tau_k, f_k = rows[:, : round(run.seconds * RATE), k]
+        motions.append(Motion(time[: len(q_k)], q_k, dq_k, tau_k, f_k, F[: len(q_k), k]))
+    return motions
