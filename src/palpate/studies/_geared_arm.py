@@ -104,7 +104,7 @@ def simulate(runs: Sequence[Run], progress: Callable[[float], None] = lambda don
     """
     h, dt = 1.0 / RATE, 1.0 / RATE / SUBSTEPS
     count = round(max(run.seconds for run in runs) * RATE)
-    time = np.arange(count + 1, dtype=np.float64) * h
+    time = np.arange(count + 3, dtype=np.float64) * h  # a little longer: differences at the end are one-sided
     K, n = len(runs), runs[0].arm.n
     B, inverse_B = runs[0].drives.B, np.linalg.inv(runs[0].drives.B)
 
@@ -119,15 +119,16 @@ def simulate(runs: Sequence[Run], progress: Callable[[float], None] = lambda don
     dq_d = np.gradient(q_d, h, axis=0)
     ddq_d = np.gradient(dq_d, h, axis=0)
     F = np.stack(
-        [np.zeros((count + 1, 6)) if run.wrench is None else run.wrench(time) for run in runs], axis=1
+        [np.zeros((len(time), 6)) if run.wrench is None else run.wrench(time) for run in runs], axis=1
     )
     arms = list({id(run.arm): run.arm for run in runs}.values())
     groups = [(arm, [k for k, run in enumerate(runs) if run.arm is arm]) for arm in arms]
-    feedforward, seen = np.empty((count + 1, K, n)), np.empty((K, n))
+    feedforward, seen = np.empty((len(time), K, n)), np.empty((K, n))
     for k, run in enumerate(runs):
         feedforward[:, k] = run.arm.inverse_dynamics(q_d[:, k], dq_d[:, k], ddq_d[:, k]) @ inverse_B
-        # the inertia each motor sees in the middle of the motion sets its gains
-        seen[k] = np.diag(inverse_B.T @ (run.arm.mass_matrix(q_d[count // 2, k]) + rotors[k]) @ inverse_B)
+        # the inertia each motor sees in the middle of its motion sets its gains
+        middle = round(0.5 * run.seconds * RATE)
+        seen[k] = np.diag(inverse_B.T @ (run.arm.mass_matrix(q_d[middle, k]) + rotors[k]) @ inverse_B)
     # the speed loop must outdo the falling branch of the Stribeck curve, or the joint creeps by jerks
     kp, kd = seen * BANDWIDTH**2, 2.0 * seen * BANDWIDTH + 1.5 * (static - coulomb) / stribeck
     ki = kp * BANDWIDTH / 4.0
