@@ -55,7 +55,10 @@ def pendulum(**changes: object) -> Arm:
         (lambda: Limits(upper=math.nan), "limits upper must not be NaN"),
         (lambda: Limits(velocity=0), "limits velocity must be > 0"),
         (lambda: Limits(effort=None), "limits effort must be a number, got None"),
-        (lambda: Effort("volts"), "effort kind must be torque, current, phase_currents or undeclared, got 'volts'"),
+        (
+            lambda: Effort("volts"),
+            "effort kind must be torque, current, phase_currents or undeclared, got 'volts'",
+        ),
         (lambda: Effort.current(0.0), "effort k_t must be numbers other than 0"),
         (lambda: Effort.current([]), "effort k_t must be numbers other than 0"),
         (lambda: Effort.current("0.1 0.2"), "effort k_t must be a number, got '0.1 0.2'"),

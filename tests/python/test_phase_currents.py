@@ -1,4 +1,4 @@
-"""Torque from two phase currents: amplitude, sign, calibration, torque constants, and the way through arm and pipeline."""
+"""Torque from two phase currents: amplitude, sign, calibration, torque constants; through arm and pipeline."""
 
 from __future__ import annotations
 
@@ -8,7 +8,17 @@ import math
 import numpy as np
 import pytest
 
-from palpate import ArmError, Effort, InputError, Log, MomentumObserver, PhaseCurrents, Pipeline, Status, robots
+from palpate import (
+    ArmError,
+    Effort,
+    InputError,
+    Log,
+    MomentumObserver,
+    PhaseCurrents,
+    Pipeline,
+    Status,
+    robots,
+)
 from palpate.identify import calibrate_phases, fit_torque_constants
 from palpate.logs import Sample, Signal
 
@@ -63,13 +73,15 @@ def test_torque_and_sign_through_reversals(hint):
 
 
 def test_a_run_in_parts_is_the_whole_run_and_reset_is_new():
-    t, q, current, theta = swing()
+    t, _q, current, theta = swing()
     a, b = (x[:, None] for x in phases(current, theta))
     drive = PhaseCurrents(1, k_t=0.5, gear=100.0, model_std=2.0)
     model = 50.0 * current[:, None]
     whole = drive.run(times(t), a, b, model_torque=model)
     drive.reset()
-    parts = [drive.run(times(t)[s], a[s], b[s], model_torque=model[s]) for s in (slice(0, 777), slice(777, None))]
+    parts = [
+        drive.run(times(t)[s], a[s], b[s], model_torque=model[s]) for s in (slice(0, 777), slice(777, None))
+    ]
     for name in ("torque", "sign_probability", "status"):
         np.testing.assert_array_equal(getattr(whole, name), np.concatenate([getattr(p, name) for p in parts]))
 
@@ -80,21 +92,32 @@ def test_a_wave_that_is_no_sine_is_held():
     w = np.zeros_like(t)
     w[3000:3040] = np.sin(np.pi * np.arange(40) / 40)
     a, b = a + w * (b - a), b + w * (a - b)
-    told = PhaseCurrents(1, k_t=1.0, gear=100.0, pole_pairs=4, angle_offset=0.7, amplitude_std=0.01, current_rate=20.0)
+    told = PhaseCurrents(
+        1, k_t=1.0, gear=100.0, pole_pairs=4, angle_offset=0.7, amplitude_std=0.01, current_rate=20.0
+    )
     found = told.run(times(t), a[:, None], b[:, None], position=q[:, None])
     held = found.status[:, 0] == Status.held
-    assert 20 < held.sum() < 90 and np.all(np.flatnonzero(held) > 2999) and np.all(np.flatnonzero(held) < 3070)
+    assert (
+        20 < held.sum() < 90 and np.all(np.flatnonzero(held) > 2999) and np.all(np.flatnonzero(held) < 3070)
+    )
     assert np.abs(found.current[:, 0] - current).max() < 0.25
-    amplitude = PhaseCurrents(1, k_t=1.0).run(times(t), a[:, None], b[:, None], controller_current=current[:, None])
+    amplitude = PhaseCurrents(1, k_t=1.0).run(
+        times(t), a[:, None], b[:, None], controller_current=current[:, None]
+    )
     assert np.abs(amplitude.current[:, 0] - current).max() > 0.25
 
 
 def test_bad_numbers_are_a_status_and_bad_shapes_an_error():
     drive = PhaseCurrents(2, k_t=[0.5, 0.6])
-    found = drive.run([0, 1], [[1.0, np.nan], [1.0, 1.0]], np.ones((2, 2)), controller_current=np.ones((2, 2)))
+    found = drive.run(
+        [0, 1], [[1.0, np.nan], [1.0, 1.0]], np.ones((2, 2)), controller_current=np.ones((2, 2))
+    )
     assert found.status[0].tolist() == [Status.ok, Status.non_finite] and found.torque[0, 1] == 0.0
     for bad, message in (
-        (lambda: drive.run([0], np.ones((1, 3)), np.ones((1, 2))), r"phase_a: expected shape \(1, 2\), got \(1, 3\)"),
+        (
+            lambda: drive.run([0], np.ones((1, 3)), np.ones((1, 2))),
+            r"phase_a: expected shape \(1, 2\), got \(1, 3\)",
+        ),
         (lambda: PhaseCurrents(2, k_t=0.0), "torque_constant"),
         (lambda: PhaseCurrents(2, k_t=[1.0, 1.0, 1.0]), "PhaseCurrents"),
         (lambda: PhaseCurrents(1, k_t=1.0, settle_time=-1.0), "settle_time"),
@@ -110,7 +133,7 @@ def test_calibration_recovers_amplitude_under_offset_and_gain_mismatch():
     t, q, current, theta = swing()
     a, b = phases(current, theta)
     scores = []
-    for seed in range(12):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         offset, gain = 0.06 * rng.uniform(-1, 1, 2), 1.0 + 0.02 * rng.uniform(-1, 1, 2)
         x = gain[0] * a + offset[0] + 0.015 * rng.standard_normal(len(a))
@@ -131,14 +154,16 @@ def test_calibration_recovers_amplitude_under_offset_and_gain_mismatch():
         )  # fmt: skip
         torque = drive.run(times(t), x[:, None], y[:, None], position=q[:, None]).current[:, 0]
         common = math.sqrt(gain[0] * gain[1])  # belongs to the torque constant
-        assert np.std(torque - common * current) < 0.018  # the noise of the readings, 2/sqrt(3) of it, and nothing more
+        assert (
+            np.std(torque - common * current) < 0.018
+        )  # the noise of the readings, 2/sqrt(3) of it, and nothing more
         assert found.noise == pytest.approx(0.015, rel=0.05)
-    assert np.sqrt(np.mean(np.square(scores), axis=0)) == pytest.approx(np.ones(4), abs=0.6)
+    assert np.sqrt(np.mean(np.square(scores), axis=0)) == pytest.approx(np.ones(4), abs=0.35)
 
 
 @pytest.mark.parametrize("offset", [-3.0, -0.1, 1.6, 3.1])
 def test_energy_tells_which_half_turn(offset):
-    t, q, current, theta = swing(offset=offset)
+    _t, q, current, theta = swing(offset=offset)
     a, b = phases(current, theta)
     found = calibrate_phases(q, a, b, 400.0)
     assert math.remainder(found.angle_offset - offset, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
@@ -146,7 +171,7 @@ def test_energy_tells_which_half_turn(offset):
 
 
 def test_calibration_refuses_what_does_not_fit():
-    t, q, current, theta = swing()
+    _t, q, current, theta = swing()
     a, b = phases(current, theta)
     with pytest.raises(InputError, match="do not follow the position at 390 electrical turns"):
         calibrate_phases(q, a, b, 390.0)
@@ -183,7 +208,7 @@ def test_torque_constants_lie_within_their_stated_deviation():
 
 
 def test_friction_does_not_reach_the_torque_constant():
-    gain, torque, current, side = static_poses(1, friction=0.0)
+    _gain, torque, current, side = static_poses(1, friction=0.0)
     without = fit_torque_constants(torque, current, side)
     with_friction = fit_torque_constants(torque, current + 5.0 * side, side)
     np.testing.assert_allclose(with_friction.gain, without.gain, rtol=1e-9)
@@ -226,7 +251,11 @@ def recorded(arm):
     a, b = phases(torque / 50.0, 400.0 * q + np.array(arm.effort.angle_offset))
     signals = {name: Signal(times(t), x, "A") for name, x in (("phase_a", a), ("phase_b", b))}
     log = Log(
-        time_ns=times(t), position=q, effort=np.full_like(q, np.nan), joint_names=arm.joint_names, signals=signals
+        time_ns=times(t),
+        position=q,
+        effort=np.full_like(q, np.nan),
+        joint_names=arm.joint_names,
+        signals=signals,
     )
     return torque, log
 
@@ -243,7 +272,8 @@ def test_a_log_of_phase_currents_goes_through_the_pipeline(arm):
     pipeline.reset()
     readings = np.stack([log.signals["phase_a"].value, log.signals["phase_b"].value], axis=2)
     live = [
-        pipeline.step(Sample(int(ns), q, None, i)) for ns, q, i in zip(log.time_ns, log.position, readings, strict=True)
+        pipeline.step(Sample(int(ns), q, None, i))
+        for ns, q, i in zip(log.time_ns, log.position, readings, strict=True)
     ]
     np.testing.assert_array_equal([x.external.torque for x in live], expected.external.torque)
 

@@ -110,7 +110,9 @@ def test_torque_is_what_the_prediction_filters(arm, motions):
         effort=motion.torque,
         joint_names=arm.joint_names,
     )
-    found = fit(arm.replace(effort=Effort.torque()), log, friction="stribeck", cutoff=6.0, cross_validate=False)
+    found = fit(
+        arm.replace(effort=Effort.torque()), log, friction="stribeck", cutoff=6.0, cross_validate=False
+    )
     from palpate.identify import prepare
 
     data = prepare(log, cutoff=6.0)
@@ -161,14 +163,19 @@ def test_the_rig_weighs():
     rig = _pulley_rig.Rig(40)
     x = rig.lift(2.0)
     assert x.mass == pytest.approx(2.0, rel=0.01)
-    error = {name: np.sqrt(np.nanmean((getattr(x, name) - x.true) ** 2)) for name in ("ours", "amplitude", "printed")}
+    error = {
+        name: np.sqrt(np.nanmean((getattr(x, name) - x.true) ** 2))
+        for name in ("ours", "amplitude", "printed")
+    }
     assert error["ours"] < 0.6 * error["amplitude"] and error["printed"] > 10.0 * error["amplitude"]
 
 
 def test_the_published_error_is_that_of_friction(arm, drives, motions):
     """30 % of Coulomb and viscous friction through J^-T make what the paper reports, 24.2 N."""
     (motion,) = simulate([Run(arm, drives, _irb2400.there_and_back, _irb2400.SECONDS)])
-    error = np.abs(_irb2400_force.friction_alone(arm, drives, motion)[round(_irb2400.BEGIN * RATE) :, 2]).mean()
+    error = np.abs(
+        _irb2400_force.friction_alone(arm, drives, motion)[round(_irb2400.BEGIN * RATE) :, 2]
+    ).mean()
     assert error == pytest.approx(24.2, rel=0.15)
 
 
