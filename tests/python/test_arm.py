@@ -62,7 +62,7 @@ def pendulum(**changes: object) -> Arm:
         (lambda: Effort.current(0.0), "effort k_t must be numbers other than 0"),
         (lambda: Effort.current([]), "effort k_t must be numbers other than 0"),
         (lambda: Effort.current("0.1 0.2"), "effort k_t must be a number, got '0.1 0.2'"),
-        (lambda: Effort("torque", (2.0,)), "k_t has a meaning for kind current only"),
+        (lambda: Effort("torque", (2.0,)), "k_t has a meaning for kinds current and phase_currents only"),
         (lambda: Shape("cone", (1,), np.eye(4), 0), "shape kind must be one of box, cylinder"),
         (lambda: Shape("box", (1, 2), np.eye(4), 0), "a box has 3 sizes, got 2"),
         (lambda: Shape("sphere", (-1,), np.eye(4), 0), "sizes of a sphere must be >= 0"),

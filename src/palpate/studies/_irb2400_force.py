@@ -247,7 +247,11 @@ def published(arm: Arm, drives: Drives, readings: Readings, sign: Array, frictio
     dq = np.gradient(q, 1.0 / RATE, axis=0)
     ddq = np.gradient(dq, 1.0 / RATE, axis=0)
     w = dq @ B.T
-    friction = (1.0 - friction_error) * (drives.coulomb * np.sign(np.round(w, 4)) + drives.viscous * w)
+    # at rest the sign of the last motion, which is kinder than none
+    moving = np.abs(w) > 1e-3
+    newest = np.maximum.accumulate(np.where(moving, np.arange(len(w))[:, None], 0), axis=0)
+    sign_of_motion = np.sign(np.take_along_axis(w, newest, axis=0))
+    friction = (1.0 - friction_error) * (drives.coulomb * sign_of_motion + drives.viscous * w)
     phases = PhaseCurrents(6, k_t=K_T, gear=GEAR)
     amplitude = phases.run(
         readings.time_ns, readings.phase_a, readings.phase_b, controller_current=sign
