@@ -21,6 +21,7 @@ from palpate import (
 )
 from palpate.identify import calibrate_phases, fit_torque_constants
 from palpate.logs import Sample, Signal
+from palpate.weigh import weigh_log
 
 DT = 1e-3
 
@@ -276,6 +277,14 @@ def test_a_log_of_phase_currents_goes_through_the_pipeline(arm):
         for ns, q, i in zip(log.time_ns, log.position, readings, strict=True)
     ]
     np.testing.assert_array_equal([x.external.torque for x in live], expected.external.torque)
+
+
+def test_weighing_takes_phase_currents(arm):
+    _, log = recorded(arm)
+    found = weigh_log(log, arm)
+    plain = weigh_log(PhaseCurrents.of(arm).convert(log), arm.replace(effort=Effort.torque()))
+    assert found.mass == plain.mass and found.mass_std == plain.mass_std
+    assert any("phase currents" in remark for remark in found.remarks)
 
 
 def test_the_log_and_sample_must_hold_both_phases(arm):

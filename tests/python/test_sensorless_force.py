@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from palpate import Effort, InputError
-from palpate.identify import FrictionModel, fit
+from palpate.identify import FrictionModel, fit, prepare
 from palpate.identify.friction import remembered_sign
 from palpate.logs import Log
-from palpate.studies import STUDIES, _irb2400, _irb2400_force, _pulley_rig
+from palpate.studies import _irb2400, _irb2400_force, _pulley_rig
 from palpate.studies._geared_arm import RATE, Run, simulate
 from palpate.studies._irb2400 import B
 
@@ -34,6 +34,16 @@ def motions(arm, drives):
             Run(arm, drives, _irb2400.excitation(1, 16.0, 0.3), 16.0),
             Run(arm, drives, _irb2400.there_and_back, 8.0, _irb2400.pushes(0)),
         ]
+    )
+
+
+def as_log(arm, motion):
+    """Its true positions and motor torques."""
+    return Log(
+        time_ns=np.rint(motion.time * 1e9).astype(np.int64),
+        position=motion.q,
+        effort=motion.torque,
+        joint_names=arm.joint_names,
     )
 
 
@@ -80,16 +90,11 @@ def test_a_load_is_a_point_mass(arm):
 
 
 def test_friction_of_coupled_motors_is_found_at_the_motors(arm, drives, motions):
-    motion = motions[0]
-    log = Log(
-        time_ns=np.rint(motion.time * 1e9).astype(np.int64),
-        position=motion.q,
-        effort=motion.torque,
-        joint_names=arm.joint_names,
-    )
+    log = as_log(arm, motions[0])
     prior = _irb2400.prior_arm(arm, 7)
     options = {"friction": FrictionModel(stribeck=True, memory=True), "cutoff": 6.0, "cross_validate": False}
     found = fit(prior, log, transmission=B, **options)
+    motion = motions[0]
     coulomb = np.array([j.friction.coulomb for j in found.arm.joints])
     assert coulomb[:3] == pytest.approx(drives.coulomb[:3], rel=0.08)
     blind = fit(prior, log, **options)
@@ -103,18 +108,10 @@ def test_friction_of_coupled_motors_is_found_at_the_motors(arm, drives, motions)
 
 
 def test_torque_is_what_the_prediction_filters(arm, motions):
-    motion = motions[0]
-    log = Log(
-        time_ns=np.rint(motion.time * 1e9).astype(np.int64),
-        position=motion.q,
-        effort=motion.torque,
-        joint_names=arm.joint_names,
-    )
+    log = as_log(arm, motions[0])
     found = fit(
         arm.replace(effort=Effort.torque()), log, friction="stribeck", cutoff=6.0, cross_validate=False
     )
-    from palpate.identify import prepare
-
     data = prepare(log, cutoff=6.0)
     (s,) = data.segments
     raw = found.torque(s.q, s.dq, s.ddq, 1.0 / s.rate)[0]
@@ -122,13 +119,7 @@ def test_torque_is_what_the_prediction_filters(arm, motions):
 
 
 def test_a_transmission_must_be_one(arm, motions):
-    motion = motions[0]
-    log = Log(
-        time_ns=np.rint(motion.time * 1e9).astype(np.int64),
-        position=motion.q,
-        effort=motion.torque,
-        joint_names=arm.joint_names,
-    )
+    log = as_log(arm, motions[0])
     for bad in (np.eye(5), np.zeros((6, 6)), B * np.nan):
         with pytest.raises(InputError, match=r"invertible \(6, 6\) matrix"):
             fit(arm, log, transmission=bad)
@@ -177,9 +168,3 @@ def test_the_published_error_is_that_of_friction(arm, drives, motions):
         _irb2400_force.friction_alone(arm, drives, motion)[round(_irb2400.BEGIN * RATE) :, 2]
     ).mean()
     assert error == pytest.approx(24.2, rel=0.15)
-
-
-@pytest.mark.slow
-def test_quick_run():
-    result = STUDIES["sensorless-force"].run(quick=True)
-    assert result.rows and all(row.ok is None for row in result.rows)

@@ -386,7 +386,7 @@ def check_effort(arm: Arm, data: RegressionData) -> Array:
         raise InputError(
             "the logs' effort is a current [A], but the arm declares torque: give Effort.current(k_t, gear)"
         )
-    if unit == "N m" and arm.effort.kind == "current":
+    if unit == "N m" and arm.effort.kind in ("current", "phase_currents"):
         raise InputError("the logs' effort is a torque [N m], but the arm declares a current")
     return arm.effort.gain(arm.n)
 

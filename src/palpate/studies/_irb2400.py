@@ -151,10 +151,7 @@ class Sensors:
         """Measure."""
         i_q = motion.torque / (K_T * GEAR)
         theta = POLE_PAIRS * GEAR * (motion.q @ B.T) + self.angle
-        a = -i_q * np.sin(theta)
-        b = 0.5 * (math.sqrt(3.0) * i_q * np.cos(theta) - a)
-        w = glitches(motion.dq @ B.T)
-        a, b = a + w * (b - a), b + w * (a - b)
+        a, b = phase_waves(i_q, theta, motion.dq @ B.T)
         noise = NOISE * NOMINAL * self._rng.standard_normal((2, *a.shape))
         return Readings(
             time_ns=np.round(motion.time * 1e9).astype(np.int64),
@@ -162,6 +159,14 @@ class Sensors:
             phase_a=a * self.gain[:, 0] + self.offset[:, 0] + noise[0],
             phase_b=b * self.gain[:, 1] + self.offset[:, 1] + noise[1],
         )
+
+
+def phase_waves(i_q: Array, theta: Array, speed: Array) -> tuple[Array, Array]:
+    """(N, n) currents of phases a and b [A] for a q-axis current [A] at an electrical angle [rad], with glitches."""
+    a = -i_q * np.sin(theta)
+    b = 0.5 * (math.sqrt(3.0) * i_q * np.cos(theta) - a)
+    w = glitches(speed)
+    return a + w * (b - a), b + w * (a - b)
 
 
 def glitches(speed: Array) -> Array:

@@ -12,7 +12,7 @@ from ..arm import Array
 from ..identify import calibrate_phases
 from ..phase import PhaseCurrents
 from ._geared_arm import RATE
-from ._irb2400 import CURRENT_RATE, GAIN_MISMATCH, NOISE, OFFSET, POLE_PAIRS, glitches, smooth
+from ._irb2400 import CURRENT_RATE, GAIN_MISMATCH, NOISE, OFFSET, POLE_PAIRS, phase_waves, smooth
 
 PULLEY = 0.032
 """radius of the paper's pulley [m]"""
@@ -71,15 +71,12 @@ class Rig:
         true += RIG_INERTIA * acceleration + RIG_COULOMB * np.tanh(speed / 0.05) + RIG_VISCOUS * speed
         theta = POLE_PAIRS * turn + self._angle
         i_q = true / RIG_K_T
-        a = -i_q * np.sin(theta)
-        b = 0.5 * (math.sqrt(3.0) * i_q * np.cos(theta) - a)
-        w = glitches(speed[:, None])[:, 0]
-        noise = NOISE * RIG_NOMINAL * self._rng.standard_normal((2, len(time)))
-        phase_a = self._scale[0] * (a + w * (b - a)) + self._zero[0] + noise[0]
-        phase_b = self._scale[1] * (b + w * (a - b)) + self._zero[1] + noise[1]
+        waves = phase_waves(i_q[:, None], theta[:, None], speed[:, None])
+        noise = NOISE * RIG_NOMINAL * self._rng.standard_normal((2, len(time), 1))
+        phase_a, phase_b = (self._scale[k] * waves[k] + self._zero[k] + noise[k] for k in range(2))
         position = np.round(turn / RIG_ENCODER) * RIG_ENCODER
-        sensors = calibrate_phases(position, phase_a, phase_b, POLE_PAIRS)
-        readings = np.round(time * 1e9).astype(np.int64), phase_a[:, None], phase_b[:, None]
+        sensors = calibrate_phases(position, phase_a[:, 0], phase_b[:, 0], POLE_PAIRS)
+        readings = np.round(time * 1e9).astype(np.int64), phase_a, phase_b
         found = PhaseCurrents(
             1,
             k_t=self.k_t,
