@@ -189,5 +189,6 @@ void bind_config(nb::module_& m, const char* name, const char* doc, std::vector<
 void bind_arm(nb::module_& m);
 void bind_pipeline(nb::module_& m);
 void bind_control(nb::module_& m);
+void bind_phase(nb::module_& m);
 
 }  // namespace palpate_py

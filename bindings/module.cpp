@@ -9,4 +9,5 @@ NB_MODULE(_core, m) {
   palpate_py::bind_arm(m);
   palpate_py::bind_pipeline(m);
   palpate_py::bind_control(m);
+  palpate_py::bind_phase(m);
 }

@@ -409,6 +409,30 @@ void bind_pipeline(nb::module_& m) {
       .def("load", [](const PyPipeline& p) { return p.pipeline.load(); })
       .def("reset", [](PyPipeline& p) { p.pipeline.reset(); });
 
+  m.def("solve_wrench", [](std::shared_ptr<const Arm> arm, const WrenchConfig& config, const Rows& position, const Rows& torque, const Stack& covariance) {
+    const std::size_t N = position.shape(0);
+    const int n = arm->n();
+    const auto un = static_cast<std::size_t>(n);
+    const double *q = checked(position, N, n, "position"), *tau = checked(torque, N, n, "torque");
+    expect(covariance.shape(0) == N && covariance.shape(1) == un && covariance.shape(2) == un, "covariance: expected shape (N, n, n)");
+    WrenchEstimator estimator(*arm, config);
+    const LoadTorque nothing_held(*arm);
+    WrenchRows out(N);
+    unlocked([&] {
+      for (std::size_t i = 0; i < N; ++i) {
+        ExternalTorque external;
+        external.torque = row(tau, i, n);
+        external.status = Status::ok;
+        JointMatrix sigma{};
+        for (int r = 0; r < n; ++r)
+          for (int c = 0; c < n; ++c) sigma(r, c) = covariance.data()[(i * un + static_cast<std::size_t>(r)) * un + static_cast<std::size_t>(c)];
+        out.fill(i, estimator.step(row(q, i, n), external, sigma, nothing_held));
+      }
+    });
+    return out.dict();
+  }, nb::arg("arm"), nb::arg("config"), nb::arg("position"), nb::arg("torque"), nb::arg("covariance"),
+        "Wrenches (one per row) of external torques (N, n) [N m] with their covariance (N, n, n) [N^2 m^2]; nothing is held.");
+
   m.def("tare", [](std::shared_ptr<const Arm> arm, double mass_std, const Times& time, const Rows& position, const OptionalRows& velocity, const Rows& effort) {
     const std::size_t N = time.shape(0);
     const int n = arm->n();

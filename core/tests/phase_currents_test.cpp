@@ -69,6 +69,48 @@ TEST(PhaseCurrents, SignFromTheElectricalAngle) {
     }
 }
 
+TEST(PhaseCurrents, AWaveThatIsNoSineIsHeld) {  // where the phase order changes, both readings pass into one another
+  PhaseTorque drive({.torque_constant = 0.5, .gear = 100.0, .pole_pairs = 4, .angle_offset = 0.7, .amplitude_std = 0.02});
+  double worst = 0.0, ignorant = 0.0;
+  int held = 0;
+  for (int k = 0; k < 400; ++k) {
+    const double q = 5e-5 * k, theta_e = 400.0 * q + 0.7, current = 2.0 + 0.001 * k;
+    const double a = -current * std::sin(theta_e), b = 0.5 * (std::numbers::sqrt3 * current * std::cos(theta_e) - a);
+    const double w = k >= 100 && k < 140 ? std::sin(pi * (k - 100) / 40.0) : 0.0;
+    const auto out = drive.step(a + w * (b - a), b + w * (a - b), 1e-3, {.position = q});
+    EXPECT_TRUE(out.status == Status::ok || out.status == Status::held);
+    if (k < 100 || k > 165) {
+      EXPECT_EQ(out.status, Status::ok);
+    }
+    held += out.status == Status::held;
+    worst = std::max(worst, std::abs(out.current - current));
+    ignorant = std::max(ignorant, std::abs(phase_amplitude(a + w * (b - a), b + w * (a - b)) - current));
+  }
+  EXPECT_GT(held, 20);
+  EXPECT_LT(worst, 0.2 * 2.1);     // what hides below direct_share, and what the torque did in the meantime
+  EXPECT_GT(ignorant, 0.25 * 2.1);  // the amplitude alone does not know
+  // Where the wave lies on the q axis only its haste gives it away.
+  for (const bool told : {false, true}) {
+    PhaseCurrentConfig config{.torque_constant = 1.0, .pole_pairs = 1, .amplitude_std = 0.02};
+    if (told) config.current_rate = 20.0;
+    PhaseTorque slow(config);
+    const double q = pi / 3.0;  // the two phases are each other's negative: swapped, the current turns over
+    double error = 0.0;
+    for (int k = 0; k < 100; ++k) {
+      const double a = -2.0 * std::sin(q), b = 0.5 * (std::numbers::sqrt3 * 2.0 * std::cos(q) - a);
+      const double w = k >= 20 && k < 60 ? std::sin(pi * (k - 20) / 40.0) : 0.0;
+      const auto out = slow.step(a + w * (b - a), b + w * (a - b), 1e-3, {.position = q});
+      error = std::max(error, std::abs(out.current - 2.0));
+      if (k > 85) {
+        EXPECT_EQ(out.status, Status::ok);
+      }
+    }
+    EXPECT_EQ(error < 0.2, told) << error;
+  }
+  PhaseTorque fresh({.torque_constant = 0.5, .gear = 100.0, .pole_pairs = 4});
+  EXPECT_EQ(fresh.step(2.0, 0.0, 1e-3, {.position = 0.0}).status, Status::warming);  // d axis only: never a good torque yet
+}
+
 TEST(PhaseCurrents, SignFromTheControllersCurrent) {
   PhaseTorque drive({.torque_constant = 0.5, .gear = -10.0});
   const auto [a, b] = phases(2.0, 1.0);
@@ -169,6 +211,8 @@ TEST(PhaseCurrents, RefusesWhatCannotWork) {
   EXPECT_THROW(PhaseTorque({}), std::invalid_argument);  // the torque constant has no default
   EXPECT_THROW(PhaseTorque({.torque_constant = 1.0, .gear = 0.0}), std::invalid_argument);
   EXPECT_THROW(PhaseTorque({.torque_constant = 1.0, .pole_pairs = -1}), std::invalid_argument);
+  EXPECT_THROW(PhaseTorque({.torque_constant = 1.0, .current_rate = 0.0}), std::invalid_argument);
+  EXPECT_THROW(PhaseTorque({.torque_constant = 1.0, .direct_share = 0.0}), std::invalid_argument);
   EXPECT_THROW(PhaseTorque({.torque_constant = 1.0, .model_std = 0.0}), std::invalid_argument);
 }
 

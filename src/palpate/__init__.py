@@ -25,6 +25,7 @@ from .arm import Arm, Effort, Friction, Joint, Limits, Sensing, Shape
 from .control import Controller, Quintic, SafetyLimiter, Setpoint
 from .errors import ArmError, DriverError, InputError, LogError, MissingExtraError, PalpateError
 from .logs import ColumnMap, Log, Recorder
+from .phase import PhaseCurrents, PhaseTorque
 from .pipeline import (
     Contact,
     ContactEvent,
@@ -68,6 +69,8 @@ __all__ = [
     "PalpateError",
     "Payload",
     "PayloadFilter",
+    "PhaseCurrents",
+    "PhaseTorque",
     "Pipeline",
     "Quintic",
     "Recorder",

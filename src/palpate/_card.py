@@ -95,9 +95,11 @@ class _Joint(_Model):
 
 
 class _Effort(_Model):
-    kind: Literal["torque", "current", "undeclared"]
+    kind: Literal["torque", "current", "phase_currents", "undeclared"]
     k_t_Nm_A: tuple[_Finite, ...] = (1.0,)
     gear: tuple[_Finite, ...] = (1.0,)
+    pole_pairs: tuple[_Finite, ...] = (0.0,)
+    angle_offset_rad: tuple[_Finite, ...] = (0.0,)
 
 
 class _Shape(_Model):
@@ -307,7 +309,13 @@ def _to_arm(card: _Card) -> Arm:
         gravity=np.array(card.gravity_m_s2),
         T_last_tip=_matrix(card.T_last_tip_m),
         grasp=np.array(card.grasp_m),
-        effort=Effort(card.effort.kind, card.effort.k_t_Nm_A, card.effort.gear),
+        effort=Effort(
+            card.effort.kind,
+            card.effort.k_t_Nm_A,
+            card.effort.gear,
+            card.effort.pole_pairs,
+            card.effort.angle_offset_rad,
+        ),
         shapes=tuple(
             Shape(
                 kind=s.kind,
@@ -451,7 +459,15 @@ def write_card(arm: Arm, path: str | os.PathLike[str]) -> None:
         "gravity_m_s2": arm.gravity.tolist(),
         "T_last_tip_m": _rows(arm.T_last_tip),
         "grasp_m": arm.grasp.tolist(),
-        "effort": _differing(_Effort(kind=arm.effort.kind, k_t_Nm_A=arm.effort.k_t, gear=arm.effort.gear)),
+        "effort": _differing(
+            _Effort(
+                kind=arm.effort.kind,
+                k_t_Nm_A=arm.effort.k_t,
+                gear=arm.effort.gear,
+                pole_pairs=arm.effort.pole_pairs,
+                angle_offset_rad=arm.effort.angle_offset,
+            )
+        ),
         "provenance": dict(arm.provenance),
         "joints": [_joint(j) for j in arm.joints],
         "frames": {

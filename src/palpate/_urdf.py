@@ -522,11 +522,15 @@ class _Extra:
                 setattr(extra, vector, element.numbers(vector, 3))
         effort = element.one("effort")
         if effort is not None:
-            effort.only(("kind", "k_t", "gear"))
+            effort.only(("kind", "k_t", "gear", "pole_pairs", "angle_offset"))
             kind: Any = effort.named("kind")
             try:
                 extra.effort = Effort(
-                    kind, effort.numbers("k_t", None, (1.0,)), effort.numbers("gear", None, (1.0,))
+                    kind,
+                    effort.numbers("k_t", None, (1.0,)),
+                    effort.numbers("gear", None, (1.0,)),
+                    effort.numbers("pole_pairs", None, (0.0,)),
+                    effort.numbers("angle_offset", None, (0.0,)),
                 )
             except ArmError as e:
                 raise ArmError(f"{effort.where}: {e}") from None
@@ -879,6 +883,10 @@ def _extra_lines(arm: Arm) -> list[str]:
         lines.append(
             f'    <effort kind="current" k_t="{_words(arm.effort.k_t)}" gear="{_words(arm.effort.gear)}"/>'
         )
+    elif arm.effort.kind == "phase_currents":
+        names = ("k_t", "gear", "pole_pairs", "angle_offset")
+        words = " ".join(f'{name}="{_words(getattr(arm.effort, name))}"' for name in names)
+        lines.append(f'    <effort kind="phase_currents" {words}/>')
     elif arm.effort.kind == "torque":
         lines.append('    <effort kind="torque"/>')
     for joint in arm.joints:

@@ -209,25 +209,43 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """What the driver's "effort" number is; there is no default. See :meth:`torque` and :meth:`current`."""
+    """What the driver's "effort" number is; there is no default.
 
-    kind: Literal["torque", "current", "undeclared"]
+    See :meth:`torque`, :meth:`current` and :meth:`phase_currents`.
+    """
+
+    kind: Literal["torque", "current", "phase_currents", "undeclared"]
     k_t: tuple[float, ...] = (1.0,)
     """torque constants [N m/A], one for all joints or one per joint"""
     gear: tuple[float, ...] = (1.0,)
     """gear ratios, motor turns per link turn; negative where the motor turns the other way"""
+    pole_pairs: tuple[float, ...] = (0.0,)
+    """phase currents only: electrical turns per motor turn, 0 where not known"""
+    angle_offset: tuple[float, ...] = (0.0,)
+    """phase currents only: electrical angle at joint position 0 [rad]"""
 
     def __post_init__(self) -> None:
-        if self.kind not in ("torque", "current", "undeclared"):
-            raise ArmError(f"effort kind must be torque, current or undeclared, got {self.kind!r}")
-        for name in ("k_t", "gear"):
+        if self.kind not in ("torque", "current", "phase_currents", "undeclared"):
+            raise ArmError(
+                f"effort kind must be torque, current, phase_currents or undeclared, got {self.kind!r}"
+            )
+        scales = self.kind in ("current", "phase_currents")
+        for name, default, meant in (
+            ("k_t", 1.0, scales),
+            ("gear", 1.0, scales),
+            ("pole_pairs", 0.0, self.kind == "phase_currents"),
+            ("angle_offset", 0.0, self.kind == "phase_currents"),
+        ):
             value: Any = getattr(self, name)
             values = tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
             numbers = tuple(_number(v, f"effort {name}") for v in values)
-            if not numbers or 0.0 in numbers:
+            if not numbers or (default == 1.0 and 0.0 in numbers):
                 raise ArmError(f"effort {name} must be numbers other than 0, got {value!r}")
-            if self.kind != "current" and numbers != (1.0,):
-                raise ArmError(f"effort {name} has a meaning for kind current only, this is {self.kind}")
+            if name == "pole_pairs" and any(v < 0.0 or v != int(v) for v in numbers):
+                raise ArmError(f"effort pole_pairs must be whole numbers, not negative, got {value!r}")
+            if not meant and numbers != (default,):
+                kinds = "kinds current and phase_currents" if default else "kind phase_currents"
+                raise ArmError(f"effort {name} has a meaning for {kinds} only, this is {self.kind}")
             object.__setattr__(self, name, numbers)
 
     @classmethod
@@ -249,6 +267,29 @@ class Effort:
         return cls("current", k_t, gear)  # type: ignore[arg-type]
 
     @classmethod
+    def phase_currents(
+        cls,
+        k_t: float | Iterable[float],
+        gear: float | Iterable[float] = 1.0,
+        pole_pairs: float | Iterable[float] = 0.0,
+        angle_offset: float | Iterable[float] = 0.0,
+    ) -> Effort:
+        """Two phase currents per motor are measured [A]; :class:`palpate.PhaseCurrents` makes torque of them.
+
+        Link-side torque = k_t * gear * I, I the peak of the phase currents with the sign of the torque.
+
+        Args:
+            k_t: torque constant per ampere of peak phase current [N m/A], one number or one per joint.
+            gear: gear ratio [1], one number or one per joint; the sign turns the direction.
+            pole_pairs: electrical turns per motor turn, 0 where not known.
+            angle_offset: electrical angle at joint position 0 [rad].
+
+        Raises:
+            ArmError: a value is zero or not finite, or pole pairs are not whole numbers.
+        """
+        return cls("phase_currents", k_t, gear, pole_pairs, angle_offset)  # type: ignore[arg-type]
+
+    @classmethod
     def undeclared(cls) -> Effort:
         """Nothing is known: models work, but asking for the gain is an error."""
         return cls("undeclared")
@@ -262,9 +303,10 @@ class Effort:
         if self.kind == "undeclared":
             raise ArmError(
                 "what the driver's effort number means is not declared: "
-                "give the arm effort=Effort.torque() or effort=Effort.current(k_t, gear)"
+                "give the arm effort=Effort.torque(), Effort.current(k_t, gear) or Effort.phase_currents(...)"
             )
-        for name, values in (("k_t", self.k_t), ("gear", self.gear)):
+        for name in ("k_t", "gear", "pole_pairs", "angle_offset"):
+            values = getattr(self, name)
             if len(values) not in (1, n):
                 raise ArmError(f"effort {name} must hold 1 or {n} numbers, got {len(values)}")
         return np.ones(n) * np.array(self.k_t) * np.array(self.gear)

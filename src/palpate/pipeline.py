@@ -30,9 +30,10 @@ from ._core import (
 from ._core import Load as CoreLoad
 from ._core import Pipeline as CorePipeline
 from ._core import tare as core_tare
-from .arm import Arm, Array
+from .arm import Arm, Array, Effort
 from .errors import ArmError, InputError, suggest
 from .logs import Log, Sample
+from .phase import PhaseCurrents
 
 Observer: TypeAlias = (
     InverseDynamicsObserver
@@ -261,23 +262,24 @@ class Pipeline:
                 raise InputError(
                     f"ContactDetector {name}: {given} numbers, arm {arm.name!r} has {arm.n} joints"
                 )
+        self._phases = PhaseCurrents.of(arm) if arm.effort.kind == "phase_currents" else None
+        model = arm if self._phases is None else arm.replace(effort=Effort.torque())
         try:
             self._core = CorePipeline(
-                arm.core, observer, payload, self.conditioner, self.load_config, wrench, contact
+                model.core, observer, payload, self.conditioner, self.load_config, wrench, contact
             )
         except ValueError as e:
             raise InputError(str(e)) from None
 
     def step(self, sample: Sample) -> Touch:
-        """Take one sample.
+        """Take one sample; its effort holds two readings per joint (n, 2) where the arm declares phase currents.
 
         Raises:
             InputError: a vector has the wrong length. Bad numbers are no error: the status says so.
         """
         try:
-            t = self._core.step(
-                sample.time_ns, sample.position, sample.velocity, sample.effort, sample.model_torque
-            )
+            effort = sample.effort if self._phases is None else self._phases.step(sample)
+            t = self._core.step(sample.time_ns, sample.position, sample.velocity, effort, sample.model_torque)
         except (ValueError, TypeError) as e:
             raise InputError(f"sample: {str(e).splitlines()[0]}") from None
         return Touch(
@@ -314,6 +316,8 @@ class Pipeline:
                 f"the log has {log.n} joints ({', '.join(log.joint_names)}), arm {self.arm.name!r} has "
                 f"{self.arm.n} ({', '.join(self.arm.joint_names)}); log.select([...]) picks joints by name"
             )
+        if self._phases is not None:
+            log = self._phases.convert(log)
         if not log.has_effort:
             raise InputError("the log has no effort (torque or current): there is nothing to weigh by")
         r = self._core.run(log.time_ns, log.position, log.velocity, log.effort, log.model_torque)
@@ -343,6 +347,8 @@ class Pipeline:
     def reset(self) -> None:
         """Back to the state before the first sample."""
         self._core.reset()
+        if self._phases is not None:
+            self._phases.reset()
 
     def options(self) -> dict[str, Any]:
         """What :meth:`from_options` needs to build the same pipeline: plain values, fit for JSON."""

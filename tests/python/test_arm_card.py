@@ -168,7 +168,7 @@ def test_a_card_written_by_hand(tmp_path):
         (
             "kind: current",
             "kind: amps",
-            r"effort.kind: input should be 'torque', 'current' or 'undeclared', got 'amps'",
+            r"effort.kind: input should be 'torque', 'current', 'phase_currents' or 'undeclared', got 'amps'",
         ),
         (
             "mass_kg: 1.5",

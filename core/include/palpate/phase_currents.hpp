@@ -33,6 +33,12 @@ inline double quadrature_current(double i_a, double i_b, double theta_e) noexcep
   return -i_a * std::sin(theta_e) + (i_a + 2.0 * i_b) / std::numbers::sqrt3 * std::cos(theta_e);
 }
 
+/// d-axis current i_d [A] at the same angle: i_d = i_alpha cos theta_e + i_beta sin theta_e. A field-oriented drive keeps it at
+/// zero, so what is not zero tells that the readings or the angle are wrong.
+inline double direct_current(double i_a, double i_b, double theta_e) noexcept {
+  return i_a * std::cos(theta_e) + (i_a + 2.0 * i_b) / std::numbers::sqrt3 * std::sin(theta_e);
+}
+
 /// Where the sign of the torque comes from, in the order of preference.
 enum class CurrentSign : std::uint8_t {
   electrical_angle = 0,    ///< Park transformation with the rotor's electrical angle
@@ -47,6 +53,9 @@ struct PhaseCurrentConfig {
   int pole_pairs = 0;              ///< electrical per mechanical turn of the motor; 0: the electrical angle is not known
   double angle_offset = 0.0;       ///< electrical angle at joint position 0 [rad]
   double amplitude_std = 0.05;     ///< noise of the amplitude [A]
+  double direct_share = 0.2;       ///< largest i_d that is believed beside 4 amplitude_std, part of the amplitude [1]
+  double current_rate = std::numeric_limits<double>::infinity();  ///< fastest change of i_q that is believed, beside noise [A/s]
+  double settle_time = 0.02;       ///< after an i_d that was not believed, readings count again so much later [s]
   double flip_rate = 5.0;          ///< sign changes to be expected near zero torque [1/s]
   double model_std = 1.0;          ///< error of the model torque that tells the sign, external torque included, at the link [N m]
   double model_time = 0.1;         ///< how long such an error lasts [s]
@@ -69,6 +78,11 @@ struct PhaseHints {
 /// (Bayes for tau_model = +-k_t G I + an error of model_std, of which only every model_time brings a new one). A current
 /// cannot change its sign but through zero: elsewhere p is a billionth per second, so a glitch of the model or a push that
 /// outdoes the model for a moment does not turn the torque over.
+///
+/// Where a motor turns back, the change of the phase order leaves a wave for some tens of milliseconds that is no sine, and whose
+/// amplitude is not the torque's. With the electrical angle known it shows as a d-axis current, or, where the field happens to
+/// stand so that the wave lies on the q axis, as a current that changes faster than the drive's does (current_rate): then the
+/// last good torque is repeated, as `held`.
 class PhaseTorque {
  public:
   explicit PhaseTorque(const PhaseCurrentConfig& config) : config_(config) {
@@ -77,6 +91,9 @@ class PhaseTorque {
     check::in_range("PhaseCurrentConfig pole_pairs", config.pole_pairs, 0, 1000);
     check::finite("PhaseCurrentConfig angle_offset [rad]", config.angle_offset);
     check::positive("PhaseCurrentConfig amplitude_std [A]", config.amplitude_std);
+    check::positive("PhaseCurrentConfig direct_share [1]", config.direct_share);
+    if (!(config.current_rate > 0.0)) check::fail("PhaseCurrentConfig current_rate [A/s]", config.current_rate, "a positive number, infinity for none");
+    check::not_negative("PhaseCurrentConfig settle_time [s]", config.settle_time);
     check::positive("PhaseCurrentConfig flip_rate [1/s]", config.flip_rate);
     check::positive("PhaseCurrentConfig model_std [N m]", config.model_std);
     check::positive("PhaseCurrentConfig model_time [s]", config.model_time);
@@ -87,7 +104,8 @@ class PhaseTorque {
     double current = 0.0;            ///< signed peak current [A]
     double sign_probability = 0.5;   ///< that the sign is right [1]
     CurrentSign source = CurrentSign::model_torque;
-    Status status = Status::warming;  ///< warming: the sign is not known (torque is 0 then); non_finite: nothing was used
+    Status status = Status::warming;  ///< warming: the sign is not known (torque is 0 then); held: the readings are no sine, the
+                                      ///< last good torque is repeated; non_finite: nothing was used
   };
 
   /// i_a, i_b measured phase currents [A]; dt time since the last call [s].
@@ -100,7 +118,21 @@ class PhaseTorque {
     if (config_.published) return finish(published_amplitude(i_a, i_b), 1.0, CurrentSign::published);
     if (config_.pole_pairs > 0 && std::isfinite(hints.position)) {
       const double theta_e = config_.pole_pairs * config_.gear * hints.position + config_.angle_offset;
-      return finish(quadrature_current(i_a, i_b, theta_e), 1.0, CurrentSign::electrical_angle);
+      const double i_d = direct_current(i_a, i_b, theta_e);
+      const double i_q = quadrature_current(i_a, i_b, theta_e);
+      age_ += dt;
+      const bool jump = known_ && std::abs(i_q - good_) > 6.0 * config_.amplitude_std + config_.current_rate * age_;
+      const bool no_sine = jump || std::abs(i_d) > 4.0 * config_.amplitude_std + config_.direct_share * phase_amplitude(i_a, i_b);
+      settling_ = no_sine ? config_.settle_time : settling_ - dt;  // such a wave may pass the q axis on its way
+      if (no_sine || settling_ > 0.0) {
+        out = finish(good_, 1.0, CurrentSign::electrical_angle);
+        out.status = known_ ? Status::held : Status::warming;
+        return out;
+      }
+      good_ = i_q;
+      age_ = 0.0;
+      known_ = true;
+      return finish(good_, 1.0, CurrentSign::electrical_angle);
     }
     const double amplitude = phase_amplitude(i_a, i_b);
     if (std::isfinite(hints.controller_current)) {
@@ -114,7 +146,10 @@ class PhaseTorque {
     return out;
   }
 
-  void reset() noexcept { odds_ = 0.0; }
+  void reset() noexcept {
+    odds_ = good_ = age_ = settling_ = 0.0;
+    known_ = false;
+  }
 
  private:
   void track(double amplitude, double dt, double model_torque) noexcept {
@@ -141,7 +176,11 @@ class PhaseTorque {
   }
 
   PhaseCurrentConfig config_;
-  double odds_ = 0.0;  // log of P(plus)/P(minus)
+  double odds_ = 0.0;   // log of P(plus)/P(minus)
+  double good_ = 0.0;   // newest i_q that was believed [A]
+  double age_ = 0.0;    // how old it is [s]
+  double settling_ = 0.0;  // until readings count again [s]
+  bool known_ = false;  // there was a good i_q
 };
 
 /// Offset and gain of one pair of current sensors: i_true = gain (reading - offset).

@@ -65,7 +65,7 @@ class DriverLaws:
         assert driver.n == len(driver.joint_names) >= 1
         assert len(set(driver.joint_names)) == driver.n
         assert isinstance(driver.period_ns, int) and driver.period_ns > 0
-        assert driver.effort.kind in ("torque", "current", "undeclared")
+        assert driver.effort.kind in ("torque", "current", "phase_currents", "undeclared")
         assert driver.state == "closed" and not driver.finished
 
     def test_verbs_out_of_order_are_refused(self) -> None:

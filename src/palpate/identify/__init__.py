@@ -3,6 +3,12 @@
 Functions from data to frozen results; nothing is printed, plotted or written. Needs the extra ``identify``.
 """
 
+from palpate.identify.currents import (
+    PhaseCalibration,
+    TorqueConstants,
+    calibrate_phases,
+    fit_torque_constants,
+)
 from palpate.identify.data import RegressionData, prepare
 from palpate.identify.fitting import Estimate, Fit, Prediction, Residuals, fit
 from palpate.identify.friction import Coupling, FrictionModel, FrictionShape
@@ -21,14 +27,18 @@ __all__ = [
     "GainFit",
     "KnownLoad",
     "LoadEstimate",
+    "PhaseCalibration",
     "Prediction",
     "RegressionData",
     "Residuals",
+    "TorqueConstants",
     "TransmissionFit",
+    "calibrate_phases",
     "estimate_load",
     "fit",
     "fit_bus_drive",
     "fit_gains",
+    "fit_torque_constants",
     "fit_transmission",
     "prepare",
 ]

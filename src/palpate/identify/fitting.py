@@ -13,18 +13,27 @@ import numpy as np
 from palpate.arm import Arm, Array, Friction
 from palpate.errors import InputError, LogError
 from palpate.identify.consistent import PRIOR, ConsistentSolution, body, consistent, prior_links
-from palpate.identify.data import Origin, RegressionData, prepare
-from palpate.identify.friction import Coupling, FrictionModel, FrictionShape
+from palpate.identify.data import Origin, RegressionData, Segment, prepare
+from palpate.identify.friction import (
+    Coupling,
+    FrictionModel,
+    FrictionShape,
+    columns,
+    coupling_columns,
+    remembered_sign,
+)
 from palpate.identify.regress import (
     Base,
     Builder,
     Problem,
     Solution,
     base_parameters,
+    check_transmission,
     fastest,
     inflation,
     least_squares,
     normal,
+    parameters,
     structural_rank,
 )
 from palpate.logs import Log
@@ -149,6 +158,8 @@ class Fit:
     seconds: tuple[float, float]
     start: Arm
     """the arm the fit started from"""
+    transmission: Array | None = None
+    """(n, n) B, motor speeds = B dq; then efforts, friction and rotor inertias are the motors'"""
 
     def predict(self, log: Log) -> Prediction:
         """Predict a log's torques with the full model (remembered friction sign, couplings).
@@ -168,7 +179,44 @@ class Fit:
 
     def _problem(self, data: RegressionData) -> Problem:
         y = data.effort * self.arm.effort.gain(self.arm.n)
-        return Builder(self.start, data, y).problem(self.friction, self.shape, self.phi)
+        builder = Builder(self.start, data, y, transmission=self.transmission)
+        return builder.problem(self.friction, self.shape, self.phi)
+
+    def torque(self, q: Array, dq: Array, ddq: Array, period: float) -> tuple[Array, Array]:
+        """What the motors must give for a motion without anything in the hand, unfiltered and causal.
+
+        Args:
+            q, dq, ddq: (N, n) of the joints, rows `period` apart [rad, rad/s, rad/s^2].
+            period: [s].
+
+        Returns:
+            (N, n) motor torque at the link side, friction included [N m], and (N, n) the remembered sign z of
+            friction in [-1, 1]: between the ends, where it turns over, friction is known less well.
+        """
+        n = self.start.n
+        time = np.arange(len(q), dtype=np.float64) * period
+        motion = Segment(time, q, dq, ddq, np.zeros_like(q), 1.0 / period, 0)
+        B = np.eye(n) if self.transmission is None else self.transmission
+        rigid = self.start.regressor(q, dq, ddq) @ self.phi[: 10 * n] @ np.linalg.inv(B)
+        motor = replace(motion, dq=dq @ B.T, ddq=ddq @ B.T)
+        z = remembered_sign(motor.dq, period, np.array([self.shape.presliding]))[0]
+        parts = columns(self.friction, motor, self.shape, rigid, z)
+        torque = rigid + np.einsum("njk,jk->nj", parts, self._terms(self.friction.terms))
+        if self.friction.rotor_inertia:
+            torque += motor.ddq * self._terms(("rotor",))[:, 0]
+        for c, coupling in enumerate(self.friction.couplings):
+            lost = coupling_columns(coupling, motor, self.shape.presliding[coupling.joints[0]])
+            at = [k for k, p in enumerate(self._kinds()) if p == ("coupling", c)]
+            torque[:, list(coupling.joints)] += (lost @ self.phi[at])[:, None]
+        return torque, z
+
+    def _kinds(self) -> list[tuple[str, int]]:
+        return [(p.kind, p.index) for p in parameters(self.start, self.friction)]
+
+    def _terms(self, kinds: Sequence[str]) -> Array:
+        """(n, len(kinds)) parameters of these kinds."""
+        place = {key: k for k, key in enumerate(self._kinds())}
+        return np.array([[self.phi[place[kind, j]] for kind in kinds] for j in range(self.start.n)])
 
     def summary(self) -> str:
         """Lines for people."""
@@ -217,6 +265,7 @@ def fit(
     prior: float = PRIOR,
     validate_on: Log | Sequence[Log] | None = None,
     cross_validate: bool = True,
+    transmission: Array | None = None,
 ) -> Fit:
     """Identify an arm's dynamics and friction from logs of free motion.
 
@@ -233,6 +282,9 @@ def fit(
         prior: weight of the prior [1]; 1 lets a link's mass deviate by 50 % (one standard deviation).
         validate_on: logs to report held-out residuals on.
         cross_validate: without ``validate_on``: hold out each log in turn (one log: each third).
+        transmission: (n, n) B, motor speeds = B dq, where a motor turns with several joints (a parallelogram:
+            [[1, 0], [1, 1]] for the two). The logs' effort is then the motors', at the link side, and so are the
+            friction and the rotor inertias found. B must be lower triangular.
 
     Raises:
         InputError: arguments do not fit each other or the data say so (units, undeclared effort).
@@ -248,7 +300,9 @@ def fit(
     data = prepare(every, cutoff=cutoff, effort=effort, weights=weights)
     gain = np.ones(arm.n) if effort is not None else check_effort(arm, data)
     check_motion(arm, data)
-    builder = Builder(arm, data, data.effort * gain)
+    drives = check_transmission(transmission, arm.n)
+    builder = Builder(arm, data, data.effort * gain, transmission=drives)
+    data = builder.data
     problem, solution = solve_shape(builder, model, method="irls" if method == "consistent" else method)
     base = base_parameters(problem, solution, structural_rank=structural_rank(arm, model))
     least = time.perf_counter() - begin
@@ -266,7 +320,7 @@ def fit(
     held, spread = None, _spread(problem, problem.y - predicted)
     if validate_on is not None:
         others = (validate_on,) if isinstance(validate_on, Log) else tuple(validate_on)
-        unseen = _problem_of(arm, others, problem, phi, data.cutoff, effort, gain)
+        unseen = _problem_of(arm, others, problem, phi, data.cutoff, effort, gain, drives)
         held, spread = _held_out(unseen, unseen.predict(phi), "validate_on")
     elif cross_validate:
         held, spread = _held_out(*_cross_validate(builder, problem, method, prior))
@@ -291,6 +345,7 @@ def fit(
         method=method,
         seconds=(least, took),
         start=arm,
+        transmission=drives,
     )
 
 
@@ -331,7 +386,7 @@ def check_effort(arm: Arm, data: RegressionData) -> Array:
         raise InputError(
             "the logs' effort is a current [A], but the arm declares torque: give Effort.current(k_t, gear)"
         )
-    if unit == "N m" and arm.effort.kind == "current":
+    if unit == "N m" and arm.effort.kind in ("current", "phase_currents"):
         raise InputError("the logs' effort is a torque [N m], but the arm declares a current")
     return arm.effort.gain(arm.n)
 
@@ -464,10 +519,12 @@ def _problem_of(
     cutoff: float,
     effort: Sequence[str] | str | None,
     gain: Array,
+    transmission: Array | None,
 ) -> Problem:
     name = effort if effort is None or isinstance(effort, str) else effort[0]
     data = prepare(logs, cutoff=cutoff, effort=name)
-    return Builder(arm, data, data.effort * gain).problem(problem.model, problem.shape, phi)
+    builder = Builder(arm, data, data.effort * gain, transmission=transmission)
+    return builder.problem(problem.model, problem.shape, phi)
 
 
 def _held_out(problem: Problem, predicted: Array, what: str) -> tuple[Residuals, tuple[Array, Array]]:

@@ -55,6 +55,12 @@ class FrictionModel:
         presliding: distances x_0 tried [rad]; one value fixes it.
         velocities: Stribeck velocities v_s tried, as parts of the joint's fastest speed [1].
         couplings: drives that turn with several joints.
+        memory: the Stribeck term, too, follows the speed only over the distance x_0, as in the LuGre model,
+            instead of at once.
+        stiction: how unknown friction at rest is, part of its range +-F_c [1]. 1: all of it, rows at rest say
+            next to nothing. Near 0: a joint keeps the friction it stopped with, so rows at rest show how
+            friction rises there; for joints that a stiff controller holds without creep. Held-out residuals
+            tell which is right.
     """
 
     stribeck: bool = False
@@ -63,8 +69,12 @@ class FrictionModel:
     presliding: tuple[float, ...] = PRESLIDING
     velocities: tuple[float, ...] = STRIBECK
     couplings: tuple[Coupling, ...] = ()
+    memory: bool = False
+    stiction: float = 1.0
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.stiction <= 1.0:
+            raise InputError(f"friction stiction must be between 0 and 1, got {self.stiction!r}")
         for name in ("presliding", "velocities"):
             values = tuple(float(v) for v in getattr(self, name))
             if not values or not all(np.isfinite(v) and v > 0.0 for v in values):
@@ -106,16 +116,17 @@ class FrictionShape:
     """v_s [rad/s]"""
 
 
-def remembered_sign(dq: Array, period: float, distance: Array) -> Array:
-    """Dahl's state z for each distance.
+def remembered_sign(dq: Array, period: float, distance: Array, level: Array | None = None) -> Array:
+    """Dahl's state z for each distance; with a level, the state that follows level sgn dq over it.
 
     Args:
         dq: (N, n) [rad/s].
         period: time between rows [s].
         distance: (K,) x_0 [rad], or (K, n).
+        level: (N, n) >= 0; None: 1.
 
     Returns:
-        (K, N, n) in [-1, 1]; starts as the sign of the first motion.
+        (K, N, n) in [-1, 1] (times the level); starts as the sign of the first motion.
     """
     travel = np.abs(dq) * period
     sign = np.sign(dq)
@@ -126,7 +137,8 @@ def remembered_sign(dq: Array, period: float, distance: Array) -> Array:
     # what happened before the log is unknown; the first motion is the best guess
     first = np.argmax(sign != 0.0, axis=0)
     state = np.broadcast_to(sign[first, np.arange(dq.shape[1])], reach.shape).copy()
-    towards = sign[:, None, :] * (1.0 - decay.transpose(1, 0, 2))
+    goal = sign if level is None else sign * level
+    towards = goal[:, None, :] * (1.0 - decay.transpose(1, 0, 2))
     steps = np.ascontiguousarray(decay.transpose(1, 0, 2))
     for k in range(len(dq)):
         state = state * steps[k] + towards[k]
@@ -155,7 +167,12 @@ def columns(
         z = remembered_sign(segment.dq, 1.0 / segment.rate, np.array([shape.presliding]))[0]
     parts = [z, segment.dq, np.ones_like(z)]
     if model.stribeck:
-        parts.append(z * np.exp(-np.square(segment.dq / np.array(shape.stribeck_velocity))))
+        bump = np.exp(-np.square(segment.dq / np.array(shape.stribeck_velocity)))
+        if model.memory:
+            reach = np.array([shape.presliding])
+            parts.append(remembered_sign(segment.dq, 1.0 / segment.rate, reach, bump)[0])
+        else:
+            parts.append(z * bump)
     if model.load:
         if load_torque is None:
             raise InputError("load-dependent friction needs the load torque")

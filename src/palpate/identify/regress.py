@@ -6,7 +6,7 @@ the friction model has; couplings). Rows of joint j hold its own friction and th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -142,21 +142,31 @@ class Builder:
         y: (M, n) left-hand side.
         transmitted: torque at the link side (N, n) per segment where it is measured: then y is what the drive
             loses, and the problems have no links.
+        transmission: (n, n) B, motor speeds = B dq, where motors turn with several joints; y, friction and rotor
+            inertia are then the motors', and "joint" below reads "motor".
     """
 
     def __init__(
-        self, arm: Arm, data: RegressionData, y: Array, transmitted: tuple[Array, ...] | None = None
+        self,
+        arm: Arm,
+        data: RegressionData,
+        y: Array,
+        transmitted: tuple[Array, ...] | None = None,
+        transmission: Array | None = None,
     ) -> None:
         if data.n != arm.n:
             raise InputError(f"the logs have {data.n} joints, arm {arm.name!r} has {arm.n}")
         self.arm = arm
-        self.data = data
         self.y = y
         self.links = transmitted is None
         self._signs: dict[tuple[int, tuple[float, ...]], Array] = {}
-        self.raw: dict[int, Array] = {}
-        if transmitted is None:
-            self.raw = {id(s): arm.regressor(s.q, s.dq, s.ddq) for s in data.segments}
+        raw = [arm.regressor(s.q, s.dq, s.ddq) for s in data.segments] if transmitted is None else []
+        if transmission is not None:
+            # virtual work: tau_motor = B^-T tau_joint
+            raw = [np.einsum("mj,njp->nmp", np.linalg.inv(transmission).T, r) for r in raw]
+            data = at_motors(data, transmission)
+        self.data = data
+        self.raw = {id(s): r for s, r in zip(data.segments, raw, strict=transmitted is None)}
         self.transmitted = {
             id(s): t for s, t in zip(data.segments, transmitted or (), strict=transmitted is not None)
         }
@@ -188,6 +198,15 @@ class Builder:
         if key not in self._signs:
             reach = np.array(model.presliding)
             self._signs[key] = remembered_sign(segment.dq, 1.0 / segment.rate, reach)
+        return self._signs[key]
+
+    def risen(self, segment: Segment, model: FrictionModel, bumps: Array) -> Array:
+        """The Stribeck term of every distance and velocity the model tries, (N, n, K, V); computed once."""
+        key = (id(segment), (*model.presliding, *model.velocities))
+        if key not in self._signs:
+            reach, period = np.array(model.presliding), 1.0 / segment.rate
+            table = [remembered_sign(segment.dq, period, reach, b) for b in np.moveaxis(bumps, 2, 0)]
+            self._signs[key] = np.array(table).transpose(2, 3, 1, 0)
         return self._signs[key]
 
     def _sign(self, segment: Segment, model: FrictionModel, shape: FrictionShape) -> Array | None:
@@ -241,7 +260,8 @@ class Builder:
             if not len(parts):
                 return z[..., None]
             bumps = np.exp(-np.square(s.dq[:, :, None] / speeds))  # (N, n, V)
-            both: Array = np.concatenate([z[..., None], z[..., None] * bumps[:, :, None, :]], axis=3)
+            risen = self.risen(s, model, bumps) if model.memory else z[..., None] * bumps[:, :, None, :]
+            both: Array = np.concatenate([z[..., None], risen], axis=3)
             return both
 
         table = data.reduce(candidates)  # (M, n, K, 1 + V)
@@ -264,6 +284,32 @@ class Builder:
             distances.append(float(best[1]))
             velocities.append(float(best[2]))
         return FrictionShape(tuple(distances), tuple(velocities))
+
+
+def at_motors(data: RegressionData, transmission: Array) -> RegressionData:
+    """The data with the motors' positions, speeds and accelerations B q, B dq, B ddq at the link side."""
+    B = transmission.T
+    segments = tuple(replace(s, q=s.q @ B, dq=s.dq @ B, ddq=s.ddq @ B) for s in data.segments)
+    return replace(data, segments=segments, q=data.q @ B, dq=data.dq @ B, ddq=data.ddq @ B)
+
+
+def check_transmission(transmission: Array | None, n: int) -> Array | None:
+    """A read-only (n, n) matrix whose motor k turns with joints from k on or before it, else an error.
+
+    Raises:
+        InputError: wrong shape, not finite, not invertible, or the torque of motor k would bear links before k.
+    """
+    if transmission is None:
+        return None
+    B = np.array(transmission, dtype=np.float64)
+    if B.shape != (n, n) or not np.isfinite(B).all() or abs(np.linalg.det(B)) < 1e-9:
+        raise InputError(f"transmission must be an invertible ({n}, {n}) matrix, motor speeds = B dq")
+    if np.any(np.abs(np.tril(np.linalg.inv(B).T, -1)) > 1e-12):
+        raise InputError(
+            "transmission: motor k may turn with joint k and with joints before it only, so B must be lower triangular"
+        )
+    B.setflags(write=False)
+    return B
 
 
 def fastest(data: RegressionData) -> Array:
@@ -345,7 +391,7 @@ def _weights(problem: Problem, phi: Array, rows: Array, *, robust: bool) -> tupl
     # the floor serves noise-free synthetic data
     sigma = np.maximum(sigma, 1e-9 * (1e-9 + np.abs(problem.y).max(axis=0)))
     # at rest friction is uniform within +-F_c, as the core's Friction::uncertainty has it
-    variance = np.square(sigma) + problem.rest * np.square(level) / 3.0
+    variance = np.square(sigma) + problem.rest * np.square(problem.model.stiction * level) / 3.0
     weights = rows / variance
     if robust:
         weights = weights / np.maximum(1.0, np.abs(residual) / (HUBER * np.sqrt(variance)))

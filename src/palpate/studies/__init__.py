@@ -90,6 +90,7 @@ def _silent(done: int, total: int, seconds_left: float) -> None:
 _ALL = (
     Study("mass-estimation", "The published mass estimation with a sliding-mode observer", "reproduce"),
     Study("lara8", "A real NEURA LARA8 weighs 5.26 kg by its motor currents", "reproduce"),
+    Study("sensorless-force", "External force of an ABB IRB 2400 from its phase currents alone", "reproduce"),
     Study("payload-filter", "The payload Kalman filter on the published bench", "bench"),
     Study("unknown-grasp", "The object is not held where it was thought", "bench"),
     Study("wrong-masses", "The arm's links do not weigh what the model says", "bench"),

@@ -25,6 +25,8 @@ def at_most(what: str, limit: float, ours: float, unit: str, note: str = "", *, 
     return Row(what, f"<= {limit:g}", ours, None, bool(ours <= limit) if judged else None, unit, note)
 
 
-def told(what: str, ours: float, unit: str, note: str = "", *, beside: float | str | None = None) -> Row:
+def told(
+    what: str, ours: float | str, unit: str, note: str = "", *, beside: float | str | None = None
+) -> Row:
     """For information, `beside` what was published or would be ideal."""
     return Row(what, beside, ours, None, None, unit, note)

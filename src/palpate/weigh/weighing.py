@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._core import Status, __version__
-from ..arm import Arm, Array
+from ..arm import Arm, Array, Effort
 from ..errors import ArmError, InputError, suggest
 from ..logs import Log
+from ..phase import PhaseCurrents
 from ..pipeline import ESTIMATORS, OBSERVERS, Pipeline, Touch
 from .noise import describe_noise
 from .scenes import Scene, telling_pose, weight_torque
@@ -500,6 +501,9 @@ def weigh_log(
         remarks.append("The arm is the one the log was recorded with.")
     log, note = fit_joints(log, arm)
     remarks += note
+    if arm.effort.kind == "phase_currents":
+        log, arm = PhaseCurrents.of(arm).convert(log), arm.replace(effort=Effort.torque())
+        remarks.append("Motor torque from two phase currents per joint.")
     unit = log.meta.get("effort_unit", "")
     if (
         (unit == "A") != (arm.effort.kind == "current")
