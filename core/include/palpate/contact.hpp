@@ -126,7 +126,7 @@ class ContactDetector {
     double z = 0.0;                              // last measurement
     double fast = 0.0, fast_variance = 0.0;      // low-passed one-step torque, and its noise
     double base = 0.0;                           // b at the onset: what is no contact
-    double growth = 0.0;                         // variance the model error may have gained since, but for stiction
+    double wandered = 0.0, renewed = 0.0;        // variance the model error may have gained since: slowly, by turns of the sign
     double bound = 0.0;                          // sqrt(3 V)
     bool feels = false, unsure = true;           // unsure of the direction of motion
     double rest = 0.0, dq = 0.0;                 // rho; q' of the last sample
@@ -222,9 +222,9 @@ class ContactDetector {
     const double V = model_variance(j, s, load, J.rest), V_rest = J.rest * rest_variance(j);
     const double back = -std::expm1(-h * (J.rest / config_.rest_time + (1.0 - J.rest) / config_.model_time));
     const double turned = J.travel.step(friction, s.dq[u(j)], s.dq_std[u(j)]) * rest_variance(j);
-    double wander = (V - V_rest) * -std::expm1(-2.0 * h / config_.model_time) + turned;
+    const double slow = (V - V_rest) * -std::expm1(-2.0 * h / config_.model_time);
     const double quick = undirected ? 4.0 * V_rest : V_rest * -std::expm1(-2.0 * h / config_.rest_time);
-    const double bound = J.bound = std::sqrt(3.0 * V), slow = wander;
+    const double bound = J.bound = std::sqrt(3.0 * V);
     const double white = white_variance(j) + 0.5 * square(m.slope[u(j)] * s.dq_std[u(j)]);
     const double input = m.input[u(j)] + 0.5 * (m.beta[u(j)] + beta_[u(j)]);
 
@@ -240,7 +240,7 @@ class ContactDetector {
     J.b -= back * (J.b - std::clamp(J.b, -bound, bound));
     if (momentum) J.p += h * (input + b_before);
     const double y = momentum ? z - J.p : z - J.b;
-    wander += quick * (y * J.b > 0.0 ? std::max(0.0, 1.0 - square(J.b / bound)) : 1.0);
+    const double wander = slow + turned + quick * (y * J.b > 0.0 ? std::max(0.0, 1.0 - square(J.b / bound)) : 1.0);
     double S, K_b;
     if (momentum) {
       J.P_pp += h * (2.0 * J.P_pb + h * J.P_bb) + h * h * white;
@@ -267,8 +267,9 @@ class ContactDetector {
       J.P_pb = 0.0;
     }
     if (J.feels) {
-      J.b = J.base;  // kept while the contact lasts; the error may wander away from it, as far as V goes
-      J.growth = std::min(J.growth + slow, V + turned);
+      J.b = J.base;  // kept while the contact lasts
+      J.wandered = std::min(J.wandered + slow, V - V_rest);
+      J.renewed = std::min(J.renewed + turned, rest_variance(j));
       return;
     }
     J.b += K_b * (elapsed_ < config_.warm_up ? y : e * std);
@@ -293,7 +294,7 @@ class ContactDetector {
       if (first == nullptr) continue;
       J.feels = alarm = true;
       J.base = J.b = J.rest > 0.5 ? std::clamp(first->b, -J.bound, J.bound) : first->b;
-      J.growth = 0.0;
+      J.wandered = J.renewed = 0.0;
       onset = std::min(onset, first->since_ns);
     }
     if (alarm && !contact_.active) {
@@ -312,7 +313,7 @@ class ContactDetector {
     for (int j = 0; j < n; ++j) {
       JointState& J = joints_[u(j)];
       if (!J.feels) continue;
-      const double std = std::sqrt(J.fast_variance + J.growth);
+      const double std = std::sqrt(J.fast_variance + J.wandered + J.renewed);
       // Of a joint at rest anything within the bound may be stiction.
       const double stiction = J.rest > 0.5 ? J.fast - std::clamp(J.fast, -J.bound, J.bound) : c[u(j)];
       quiet = quiet && std::min(std::abs(c[u(j)]) - 3.0 * std, std::abs(stiction) - 3.0 * std::sqrt(J.fast_variance)) < 0.0;
@@ -335,7 +336,7 @@ class ContactDetector {
       for (int j = 0; j < n; ++j) {  // a new start from what is there now
         JointState& J = joints_[u(j)];
         J.b = J.fast;
-        J.P_bb = J.P_bb + J.fast_variance + J.growth;
+        J.P_bb += J.fast_variance + J.wandered + J.renewed;
         J.P_pb = 0.0;
         J.sums = {};
         J.feels = false;
@@ -372,7 +373,7 @@ class ContactDetector {
     for (int j = 0; j < n; ++j) {
       const JointState& S = joints_[u(j)];
       if (j <= link) J[u(j)] = jacobian_column(*arm_, P, j, x);
-      variance[u(j)] = S.fast_variance + S.growth + S.P_bb + 1e-12;
+      variance[u(j)] = S.fast_variance + S.wandered + S.renewed + S.P_bb + 1e-12;
     }
     Vec3<double> F{};
     double left = 0.0;
@@ -407,7 +408,7 @@ class ContactDetector {
     for (int j = 0; j < arm_->n(); ++j) {
       const JointState& J = joints_[u(j)];
       contact_.torque[u(j)] = contact_.active ? felt_torque(J) : 0.0;
-      contact_.std[u(j)] = std::sqrt(J.fast_variance + J.growth + J.P_bb);
+      contact_.std[u(j)] = std::sqrt(J.fast_variance + J.wandered + J.renewed + J.P_bb);
       double level = J.feels ? 1.0 : 0.0;
       for (std::size_t k = 0; !J.feels && k < J.sums.size(); ++k) level = std::max(level, h_[k / 2] > 0.0 ? J.sums[k].g / h_[k / 2] : 0.0);
       contact_.level[u(j)] = level;
