@@ -206,3 +206,35 @@ def test_bad_options_are_one_clear_line(arm):
         pp.HeldLoad(com=(0.0, 1.0))
     with pytest.raises(ValueError, match="unknown option 'rate'"):
         pp.ContactDetector(rate=1.0)
+
+
+def test_the_noise_of_a_model_is_measured(arm):
+    rng = np.random.default_rng(3)
+    log = swing(arm, 120.0)
+    phi = np.exp(-1.0 / (RATE * 0.4))
+    slow = np.zeros((len(log), arm.n))
+    for k in range(1, len(log)):
+        slow[k] = phi * slow[k - 1] + math.sqrt(1.0 - phi * phi) * 0.8 * rng.normal(size=arm.n)
+    noisy = pp.Log(
+        time_ns=log.time_ns,
+        position=log.position,
+        velocity=log.velocity,
+        effort=log.effort + slow + rng.normal(0.0, 0.3, slow.shape),
+        joint_names=log.joint_names,
+    )
+    noise = pp.contact_noise(arm, [noisy[0:30000], noisy[30000 : len(log)]])
+    assert np.allclose(noise.torque_std, 0.3, rtol=0.2)
+    assert np.allclose(noise.model_std, 0.8, rtol=0.35)
+    assert 0.2 < noise.model_time < 0.8
+    assert noise.velocity_std is not None
+    heavy = slice(0, 4)  # the wrist's momentum hardly shows its velocity
+    assert np.allclose(noise.velocity_std[heavy], 2e-4, rtol=0.5)
+    pipeline = pp.Pipeline(
+        noise.arm(arm), observer=pp.MomentumObserver(), payload=None, contact=noise.detector()
+    )
+    assert pipeline.run(noisy).contact.count[-1] == 0
+
+
+def test_noise_needs_motion(arm):
+    with pytest.raises(pp.InputError, match="A1, A2.*fewer than 500 samples"):
+        pp.contact_noise(arm, [swing(arm, 0.5)])
