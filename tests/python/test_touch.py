@@ -227,7 +227,7 @@ def test_the_noise_of_a_model_is_measured(arm):
     assert np.allclose(noise.model_std, 0.8, rtol=0.35)
     assert 0.2 < noise.model_time < 0.8
     assert noise.velocity_std is not None
-    heavy = slice(0, 4)  # the wrist's momentum hardly shows its velocity
+    heavy = [0, 1, 3]  # of the light ones the momentum hardly shows the velocity
     assert np.allclose(noise.velocity_std[heavy], 2e-4, rtol=0.5)
     pipeline = pp.Pipeline(
         noise.arm(arm), observer=pp.MomentumObserver(), payload=None, contact=noise.detector()
