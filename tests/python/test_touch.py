@@ -238,3 +238,36 @@ def test_the_noise_of_a_model_is_measured(arm):
 def test_noise_needs_motion(arm):
     with pytest.raises(pp.InputError, match="A1, A2.*fewer than 500 samples"):
         pp.contact_noise(arm, [swing(arm, 0.5)])
+
+
+def test_friction_that_remembers_and_grows_with_load_is_no_push(arm):
+    friction = pp.Friction(coulomb=2.0, viscous=0.3, load=0.05, presliding=1e-3)
+    arm = arm.replace(joints=tuple(j.replace(friction=friction) for j in arm.joints))
+    log = swing(arm, 20.0)
+    # what the log's friction lacks beside the smooth sign and Coulomb's part: memory and load, as the gear feels them
+    smooth = arm.friction_torque(log.velocity)
+    gear = log.effort - smooth
+    z = np.zeros(arm.n)
+    extra = np.zeros_like(gear)
+    for k in range(1, len(log)):
+        step = log.position[k] - log.position[k - 1]
+        s = np.sign(step)
+        z = s + (z - s) * np.exp(-np.abs(step) / friction.presliding)
+        level = friction.coulomb + friction.load * np.abs(gear[k])
+        extra[k] = level * z + friction.viscous * log.velocity[k] - smooth[k]
+    log = pp.Log(
+        time_ns=log.time_ns,
+        position=log.position,
+        velocity=log.velocity,
+        effort=log.effort + extra,
+        joint_names=log.joint_names,
+    )
+    forgetful = arm.replace(
+        joints=tuple(j.replace(friction=pp.Friction(coulomb=2.0, viscous=0.3)) for j in arm.joints)
+    )
+    rms = [
+        np.sqrt(np.mean(np.square(feeling(a).run(log).external.torque[500:]), axis=0))
+        for a in (arm, forgetful)
+    ]
+    assert (rms[0] < 0.4).all()  # of noise
+    assert rms[1].max() > 1.5

@@ -211,4 +211,22 @@ class Arm {
   bool has_dynamics_ = false;
 };
 
+/// FrictionHistory of every joint: takes out of a sample's torque what friction is beyond a function of the velocity, so that
+/// no observer need remember anything.
+class FrictionMemory {
+ public:
+  void step(const Arm& arm, JointSample& s) noexcept {
+    if (s.status == Status::non_finite || s.status == Status::time_error) return;
+    for (int j = 0; j < arm.n(); ++j) {
+      const auto u = static_cast<std::size_t>(j);
+      const double excess = joints_[u].step(arm.joint(j).friction, s.q[u], std::sqrt(arm.position_variance(j)), s.dq[u], s.tau[u]);
+      s.friction_excess[u] = excess;
+      s.tau[u] -= excess;
+    }
+  }
+
+ private:
+  std::array<FrictionHistory, max_joints> joints_{};
+};
+
 }  // namespace palpate

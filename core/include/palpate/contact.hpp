@@ -10,7 +10,7 @@ namespace palpate {
 /// Where the detector takes its residual from.
 enum class ContactSource : std::uint8_t {
   momentum = 0,        ///< generalised momentum and the arm's own model
-  model_residual = 1,  ///< the controller's bare-arm torque less the measured one; needs no masses
+  model_residual = 1,  ///< the controller's bare-arm torque and the friction, less the measured torque; needs no masses
 };
 
 struct ContactConfig {
@@ -44,7 +44,7 @@ struct ContactConfig {
 /// The thresholds follow from the rate by Siegmund's approximation of the mean time between false alarms of one sum,
 ///   ARL = (exp(x) - x - 1)/(2 kappa^2) samples,  x = 2 kappa (h + 1.166),   ARL = 8 n 3600/(rate dt),
 /// n joints with eight sums each, which share the rate; contact_test.cpp counts alarms. With model_residual,
-/// z = tau_model - tau = b + w.
+/// z = tau_model + tau_f - tau = b + w. Where friction remembers (FrictionHistory), stiction lies around what it remembers.
 ///
 /// The onset is when the alarmed sum last left zero. From then on b of an alarmed joint is kept and what the joint feels beyond
 /// it is the contact's torque c, until it has been within three standard deviations, or stiction, for release_time.
@@ -127,11 +127,14 @@ class ContactDetector {
     double fast = 0.0, fast_variance = 0.0;      // low-passed one-step torque, and its noise
     double base = 0.0;                           // b at the onset: what is no contact
     double wandered = 0.0, renewed = 0.0;        // variance the model error may have gained since: slowly, by turns of the sign
-    double bound = 0.0;                          // sqrt(3 V)
+    double bound = 0.0, center = 0.0;            // sqrt(3 V); b at rest lies within center +- bound
     bool feels = false, unsure = true;           // unsure of the direction of motion
     double rest = 0.0, dq = 0.0;                 // rho; q' of the last sample
     double felt = 0.0;                           // how long the joint has felt this contact [s]
     SignTravel travel{};
+
+    /// The part of b that the model's errors may be.
+    double stiction(double x) const noexcept { return std::clamp(x, center - bound, center + bound); }
   };
   struct Measurement {
     JointVector z{}, input{}, beta{}, variance{}, slope{};  // variance of z
@@ -143,7 +146,7 @@ class ContactDetector {
     Measurement m;
     const int n = arm_->n();
     if (config_.source == ContactSource::model_residual) {
-      for (int j = 0; j < n; ++j) m.z[u(j)] = s.model_torque[u(j)] - s.tau[u(j)] - load.torque()[u(j)];
+      for (int j = 0; j < n; ++j) m.z[u(j)] = s.model_torque[u(j)] + arm_->joint(j).friction.torque(s.dq[u(j)]) - s.tau[u(j)] - load.torque()[u(j)];
       return m;
     }
     const MomentumTerms<double> t = momentum_terms<double>(*arm_, s.q, s.dq);
@@ -171,10 +174,12 @@ class ContactDetector {
   double model_variance(int j, const JointSample& s, const LoadTorque& load, double rest) const noexcept {
     const JointDescription& d = arm_->joint(j);
     constexpr double fast = 1e3;  // in units of v_0: motion for certain
-    return rest * rest_variance(j) + (1.0 - rest) * square(d.friction.uncertainty(fast * d.friction.sign_velocity, config_.friction_fraction)) +
+    return rest * rest_variance(j, s) + (1.0 - rest) * square(d.friction.uncertainty(fast * d.friction.sign_velocity, config_.friction_fraction, s.tau[u(j)])) +
            square(config_.model_std[u(j)]) + square(d.torque_gain_std * s.tau[u(j)]) + square(load.std(j)) + 1e-18;
   }
-  double rest_variance(int j) const noexcept { return square(arm_->joint(j).friction.uncertainty(0.0, config_.friction_fraction)); }
+  double rest_variance(int j, const JointSample& s) const noexcept {
+    return square(arm_->joint(j).friction.uncertainty(0.0, config_.friction_fraction, s.tau[u(j)]));
+  }
   double white_variance(int j) const noexcept { return arm_->torque_variance(j) + square(config_.noise_std[u(j)]) + 1e-18; }
 
   void begin(const JointSample& s, const LoadTorque& load, const Measurement& m) noexcept {
@@ -219,12 +224,13 @@ class ContactDetector {
     J.unsure = unsure;
     J.dq = s.dq[u(j)];
     J.rest = std::max(undirected ? 1.0 : 1.0 - square(std::tanh(s.dq[u(j)] / friction.sign_velocity)), J.rest * std::exp(-h / config_.settle_time));
-    const double V = model_variance(j, s, load, J.rest), V_rest = J.rest * rest_variance(j);
+    const double V = model_variance(j, s, load, J.rest), V_rest = J.rest * rest_variance(j, s);
     const double back = -std::expm1(-h * (J.rest / config_.rest_time + (1.0 - J.rest) / config_.model_time));
-    const double turned = J.travel.step(friction, s.dq[u(j)], s.dq_std[u(j)]) * rest_variance(j);
+    const double turned = J.travel.step(friction, s.dq[u(j)], s.dq_std[u(j)]) * rest_variance(j, s);
     const double slow = (V - V_rest) * -std::expm1(-2.0 * h / config_.model_time);
     const double quick = undirected ? 4.0 * V_rest : V_rest * -std::expm1(-2.0 * h / config_.rest_time);
-    const double bound = J.bound = std::sqrt(3.0 * V);
+    J.bound = std::sqrt(3.0 * V);
+    J.center = J.rest * s.friction_excess[u(j)];
     const double white = white_variance(j) + 0.5 * square(m.slope[u(j)] * s.dq_std[u(j)]);
     const double input = m.input[u(j)] + 0.5 * (m.beta[u(j)] + beta_[u(j)]);
 
@@ -237,10 +243,11 @@ class ContactDetector {
 
     // Prediction and update of (p, b), or of b alone. Friction at rest is quick up to the bound, not beyond it.
     const double b_before = J.b;
-    J.b -= back * (J.b - std::clamp(J.b, -bound, bound));
+    J.b -= back * (J.b - J.stiction(J.b));
     if (momentum) J.p += h * (input + b_before);
     const double y = momentum ? z - J.p : z - J.b;
-    const double wander = slow + turned + quick * (y * J.b > 0.0 ? std::max(0.0, 1.0 - square(J.b / bound)) : 1.0);
+    const double off = J.b - J.center;
+    const double wander = slow + turned + quick * (y * off > 0.0 ? std::max(0.0, 1.0 - square(off / J.bound)) : 1.0);
     double S, K_b;
     if (momentum) {
       J.P_pp += h * (2.0 * J.P_pb + h * J.P_bb) + h * h * white;
@@ -269,7 +276,7 @@ class ContactDetector {
     if (J.feels) {
       J.b = J.base;  // kept while the contact lasts
       J.wandered = std::min(J.wandered + slow, V - V_rest);
-      J.renewed = std::min(J.renewed + turned, rest_variance(j));
+      J.renewed = std::min(J.renewed + turned, rest_variance(j, s));
       return;
     }
     J.b += K_b * (elapsed_ < config_.warm_up ? y : e * std);
@@ -293,7 +300,7 @@ class ContactDetector {
         if (J.sums[k].g > h_[k / 2] && (first == nullptr || J.sums[k].since_ns > first->since_ns)) first = &J.sums[k];
       if (first == nullptr) continue;
       J.feels = alarm = true;
-      J.base = J.b = J.rest > 0.5 ? std::clamp(first->b, -J.bound, J.bound) : first->b;
+      J.base = J.b = J.rest > 0.5 ? J.stiction(first->b) : first->b;
       J.wandered = J.renewed = 0.0;
       onset = std::min(onset, first->since_ns);
     }
@@ -315,7 +322,7 @@ class ContactDetector {
       if (!J.feels) continue;
       const double std = std::sqrt(J.fast_variance + J.wandered + J.renewed);
       // Of a joint at rest anything within the bound may be stiction.
-      const double stiction = J.rest > 0.5 ? J.fast - std::clamp(J.fast, -J.bound, J.bound) : c[u(j)];
+      const double stiction = J.rest > 0.5 ? J.fast - J.stiction(J.fast) : c[u(j)];
       quiet = quiet && std::min(std::abs(c[u(j)]) - 3.0 * std, std::abs(stiction) - 3.0 * std::sqrt(J.fast_variance)) < 0.0;
       double shaken = 0.0;
       for (int i = 0; i < n; ++i)
