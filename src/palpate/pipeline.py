@@ -164,7 +164,9 @@ class Contact:
                     link=int(self.link[last]),
                     farthest=int(self.farthest[clearest]),
                     tip=bool(self.tip[clearest]),
+                    clearest=int(clearest),
                     torque=np.array(self.torque[clearest]),
+                    std=np.array(self.std[clearest]),
                 )
             )
         return found
@@ -186,8 +188,12 @@ class ContactEvent:
     """the farthest link on which one force would explain what all joints feel"""
     tip: bool
     """a force at the grasp point would explain it"""
+    clearest: int
+    """row of the run in which it shows best, in standard deviations"""
     torque: Array
-    """(n,) [N m] at its clearest sample"""
+    """(n,) [N m] in that row"""
+    std: Array
+    """(n,) its standard deviation [N m]"""
 
 
 @dataclass(frozen=True, slots=True)

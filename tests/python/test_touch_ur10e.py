@@ -19,7 +19,14 @@ TRAINED = (
     "identification_data/ur-20_02_12-40sec_12harm.csv",
     "identification_data/ur-20_02_19_14harm50sec.csv",
 )
-COLUMNS = ColumnMap(time=0, time_unit="s", position=range(1, 7), velocity=range(7, 13), effort=range(13, 19), effort_unit="A")  # fmt: skip
+COLUMNS = ColumnMap(
+    time=0,
+    time_unit="s",
+    position=range(1, 7),
+    velocity=range(7, 13),
+    effort=range(13, 19),
+    effort_unit="A",
+)
 
 
 @pytest.fixture(scope="module")

@@ -125,8 +125,8 @@ class ContactDetector {
     std::array<Sum, 8> sums{};                   // g+ and g- of every drift
     double z = 0.0;                              // last measurement
     double fast = 0.0, fast_variance = 0.0;      // low-passed one-step torque, and its noise
-    double base = 0.0;                           // b at the onset: what is no contact
-    double wandered = 0.0, renewed = 0.0;        // variance the model error may have gained since: slowly, by turns of the sign
+    double base = 0.0;                           // b at the onset of the contact: what is no contact
+    double wandered = 0.0, renewed = 0.0;        // variance of base: as known then and what wandered since; by turns of the sign
     double bound = 0.0, center = 0.0;            // sqrt(3 V); b at rest lies within center +- bound
     bool feels = false, unsure = true;           // unsure of the direction of motion
     double rest = 0.0, dq = 0.0;                 // rho; q' of the last sample
@@ -273,10 +273,12 @@ class ContactDetector {
       J.P_pp = R;
       J.P_pb = 0.0;
     }
+    if (contact_.active) {
+      J.wandered = std::min(J.wandered + slow, std::max(J.wandered, V - V_rest));
+      J.renewed = std::min(J.renewed + turned, rest_variance(j, s));
+    }
     if (J.feels) {
       J.b = J.base;  // kept while the contact lasts
-      J.wandered = std::min(J.wandered + slow, V - V_rest);
-      J.renewed = std::min(J.renewed + turned, rest_variance(j, s));
       return;
     }
     J.b += K_b * (elapsed_ < config_.warm_up ? y : e * std);
@@ -300,8 +302,7 @@ class ContactDetector {
         if (J.sums[k].g > h_[k / 2] && (first == nullptr || J.sums[k].since_ns > first->since_ns)) first = &J.sums[k];
       if (first == nullptr) continue;
       J.feels = alarm = true;
-      J.base = J.b = J.rest > 0.5 ? J.stiction(first->b) : first->b;
-      J.wandered = J.renewed = 0.0;
+      if (!contact_.active) J.base = J.rest > 0.5 ? J.stiction(first->b) : first->b;
       onset = std::min(onset, first->since_ns);
     }
     if (alarm && !contact_.active) {
@@ -309,6 +310,12 @@ class ContactDetector {
       ++contact_.count;
       contact_.onset_time_ns = onset;
       contact_.alarm_time_ns = s.time_ns;
+      for (int j = 0; j < n; ++j) {  // a joint that feels it later has taken some of it for its model's error by then
+        JointState& J = joints_[u(j)];
+        if (!J.feels) J.base = J.b;
+        J.wandered = J.P_bb;
+        J.renewed = 0.0;
+      }
     }
     if (!contact_.active) return;
     bool quiet = true;

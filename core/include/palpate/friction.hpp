@@ -61,15 +61,12 @@ struct Friction {
 
   /// Standard deviation [N m] of the friction torque about torque().
   ///
-  /// At rest friction is any torque within +-F, F = max(F_c, F_s): uniform, hence F/sqrt(3). In motion the model is good
-  /// to fraction F_c, fraction [1]. In between the variances are mixed with the weight 1 - tanh^2(dq/v_0) of "at rest".
+  /// At rest friction is any torque within +-F, F the level at no speed: uniform, hence F/sqrt(3). In motion the model is
+  /// good to a fraction [1] of the level. In between the variances are mixed with the weight 1 - tanh^2(dq/v_0) of "at rest".
   [[nodiscard]] double uncertainty(double dq, double fraction, double tau_load = 0.0) const noexcept {
     const double sign = std::tanh(dq / sign_velocity);
-    const double moving = coulomb + load * std::abs(tau_load);
-    const double excess = has_stribeck() ? std::fmax(0.0, static_ - coulomb) : 0.0;
-    const double rest_var = (moving + excess) * (moving + excess) / 3.0;
-    const double moving_std = fraction * moving;
-    return std::sqrt((1.0 - sign * sign) * rest_var + sign * sign * moving_std * moving_std);
+    const double rest = level(0.0, tau_load), moving = fraction * level(dq, tau_load);
+    return std::sqrt((1.0 - sign * sign) * rest * rest / 3.0 + sign * sign * moving * moving);
   }
 
   /// What is wrong with the parameters, in one line; empty if nothing is. Every constructor that takes one asks.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from .replay import Difference, Replay, replay
 from .scenes import Scene, find_pose, load_arm, scene, telling_pose, weight_torque
 from .session import Moment, Session, Task, arm_of, arrival, brick, check_mass, run
-from .weighing import Hold, Weighing, fit_joints, make_pipeline, weigh_log, weigh_session
+from .weighing import Hold, Weighing, fit_joints, fit_log, make_pipeline, refused, weigh_log, weigh_session
 
 __all__ = [
     "Difference",
@@ -22,8 +22,10 @@ __all__ = [
     "check_mass",
     "find_pose",
     "fit_joints",
+    "fit_log",
     "load_arm",
     "make_pipeline",
+    "refused",
     "replay",
     "run",
     "scene",

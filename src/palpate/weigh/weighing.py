@@ -503,8 +503,41 @@ def weigh_log(
     if arm is None:
         arm = arm_of(log)
         remarks.append("The arm is the one the log was recorded with.")
-    log, note = fit_joints(log, arm)
+    arm, log, note = fit_log(log, arm)
     remarks += note
+    pipeline, decided = make_pipeline(arm, estimator, observer, model_torque=log.model_torque is not None)
+    remarks += decided
+    touch = pipeline.run(log)
+    result = Weighing(
+        arm=arm,
+        pipeline=pipeline.options(),
+        log=log,
+        touch=touch,
+        status=Status(int(touch.payload.status[-1])) if len(log) else Status.warming,
+        truth=_truth(log),
+        desired=_setpoints(log),
+    )
+    remarks += refused(touch)
+    return replace(result, remarks=(*_why(result, None), *remarks))
+
+
+def refused(touch: Touch) -> list[str]:
+    """How many samples of a run were not used, and why; empty if all were."""
+    bad = int(np.count_nonzero(np.isin(touch.status, [int(Status.non_finite), int(Status.time_error)])))
+    if not bad:
+        return []
+    return [
+        f"{bad} of {len(touch.status)} samples were not used: NaN, absurd numbers or times that do not rise."
+    ]
+
+
+def fit_log(log: Log, arm: Arm) -> tuple[Arm, Log, list[str]]:
+    """Arm and log made for each other: the arm's joints in its order, noise described; and what was assumed for that.
+
+    Raises:
+        InputError: they do not fit: joints, or torque where the arm says current.
+    """
+    log, remarks = fit_joints(log, arm)
     unit = log.meta.get("effort_unit", "")
     if (
         (unit == "A") != (arm.effort.kind == "current")
@@ -518,24 +551,7 @@ def weigh_log(
     if arm.effort.kind != "undeclared":
         arm, said = describe_noise(arm, log)
         remarks += [said] if said else []
-    pipeline, decided = make_pipeline(arm, estimator, observer, model_torque=log.model_torque is not None)
-    remarks += decided
-    touch = pipeline.run(log)
-    result = Weighing(
-        arm=arm,
-        pipeline=pipeline.options(),
-        log=log,
-        touch=touch,
-        status=Status(int(touch.payload.status[-1])) if len(log) else Status.warming,
-        truth=_truth(log),
-        desired=_setpoints(log),
-    )
-    bad = int(np.count_nonzero(np.isin(touch.status, [int(Status.non_finite), int(Status.time_error)])))
-    if bad:
-        remarks.append(
-            f"{bad} of {len(log)} samples were not used: NaN, absurd numbers or times that do not rise."
-        )
-    return replace(result, remarks=(*_why(result, None), *remarks))
+    return arm, log, remarks
 
 
 def _setpoints(log: Log) -> tuple[Array, Array] | None:
