@@ -32,12 +32,13 @@ struct ContactConfig {
 ///
 /// Untouched, a joint obeys  p' = tau + C^T q' - g - tau_f + tau_L + b + w,  z = p + noise of q' seen through M, where b is what
 /// the model gets wrong: not white, but a process whose size and correlation time depend on the motion,
-///   V = rho F^2/3 + (1 - rho) (friction_fraction F_c)^2 + model_std^2 + (torque_gain_std tau)^2 + Var(tau_L)_j,
+///   V = rho ((1 + friction_fraction) F)^2/3 + (1 - rho) (friction_fraction F_c)^2 + model_std^2 + (torque_gain_std tau)^2 + Var(tau_L)_j,
 ///   1/T = rho/rest_time + (1 - rho)/model_time,      rho = max(1 - tanh^2(q'/v_0), what it was, fading with settle_time):
 /// slow and small in motion; at rest anything within stiction +-F, and quick, as a drive may load its gear at any time without
-/// moving it; and so for a moment after rest, until friction has settled. Within +-sqrt(3 V) (+-F at rest) b walks at random,
-/// 2 V/T per second (to any place at once while the direction of motion is not sure), and may stay where it is; beyond it stiction drives it no further and it returns with time constant T, or
-/// a contact has brought it there. A turn of the sign renews it (SignTravel). So reversals, starts and stops are no contacts.
+/// moving it; and so for a moment after rest, until friction has settled. Within +-sqrt(3 V), at rest stiction and two deviations
+/// of the slow errors, b walks at random, 2 V/T per second (to any place at once while the direction of motion is not sure), and
+/// may stay where it is; beyond it stiction drives it no further and it returns with time constant T, or a contact has brought
+/// it there. A turn of the sign renews it (SignTravel). So reversals, starts and stops are no contacts.
 /// A Kalman filter of two states per joint, (p, b), takes all that is expected out of z; what is left, e = innovation/std, is
 /// white with variance 1 as long as nothing touches the arm. Then for kappa = 1/4, 1/2, 1, 2, from soft contacts to hard ones,
 ///   g+ <- max(0, g+ + e - kappa),  g- <- max(0, g- - e - kappa),  alarm at g > h(kappa).
@@ -178,7 +179,7 @@ class ContactDetector {
            square(config_.model_std[u(j)]) + square(d.torque_gain_std * s.tau[u(j)]) + square(load.std(j)) + 1e-18;
   }
   double rest_variance(int j, const JointSample& s) const noexcept {
-    return square(arm_->joint(j).friction.uncertainty(0.0, config_.friction_fraction, s.tau[u(j)]));
+    return square((1.0 + config_.friction_fraction) * arm_->joint(j).friction.uncertainty(0.0, config_.friction_fraction, s.tau[u(j)]));
   }
   double white_variance(int j) const noexcept { return arm_->torque_variance(j) + square(config_.noise_std[u(j)]) + 1e-18; }
 
@@ -229,7 +230,7 @@ class ContactDetector {
     const double turned = J.travel.step(friction, s.dq[u(j)], s.dq_std[u(j)]) * rest_variance(j, s);
     const double slow = (V - V_rest) * -std::expm1(-2.0 * h / config_.model_time);
     const double quick = undirected ? 4.0 * V_rest : V_rest * -std::expm1(-2.0 * h / config_.rest_time);
-    J.bound = std::sqrt(3.0 * V);
+    J.bound = (1.0 - J.rest) * std::sqrt(3.0 * V) + J.rest * (std::sqrt(3.0 * V_rest) + 2.0 * std::sqrt(V - V_rest));
     J.center = J.rest * s.friction_excess[u(j)];
     const double white = white_variance(j) + 0.5 * square(m.slope[u(j)] * s.dq_std[u(j)]);
     const double input = m.input[u(j)] + 0.5 * (m.beta[u(j)] + beta_[u(j)]);

@@ -99,11 +99,12 @@ struct Friction {
 ///   z <- s + (z - s) exp(-|dx|/x_0),   s = sgn dx,   |z| <= 1,
 /// dx the travel, kept once it is beyond noise, four standard deviations of the position and x_0/20: until then it is elastic,
 /// and noise at rest wears nothing off. z = 0 until the joint has moved. tau_f = (F_c + ...) z + F_v dq + F_o; with
-/// presliding = 0, z = tanh(dq/v_0). tau_load of F_c = F_c0 + load |tau_load| is what the gear passes on: the measured torque
-/// without the friction.
+/// presliding = 0, z = tanh(dq/v_0). tau_load of F_c = F_c0 + load |tau_load| is what the gear passes on: the torque of the
+/// motor without the friction, nor what its rotor takes.
 class FrictionHistory {
  public:
-  /// tau_f - Friction::torque(dq) [N m], a mean over the time since the last call. q, q_std [rad]; dq [rad/s]; tau [N m].
+  /// tau_f - Friction::torque(dq) [N m], a mean over the time since the last call. q, q_std [rad]; dq [rad/s];
+  /// tau, without the rotor's part [N m].
   double step(const Friction& friction, double q, double q_std, double dq, double tau) noexcept {
     if (friction.presliding == 0.0 && friction.load == 0.0) return 0.0;
     if (!started_) q_ = q, tau_load_ = tau;

@@ -33,6 +33,8 @@ HOURS = 100.0
 """of the campaign, per arm"""
 ALARMS_PER_HOUR = 1e-3
 """that the detector is asked for"""
+FASTEST = 1.5
+"""of the simulated motion [rad/s]"""
 HARD = 37.5e3
 """rise of a hard contact's force [N/s]: 0.25 m/s against 150 N/mm, a skull in ISO/TS 15066"""
 HARD_MOST = 300.0
@@ -249,12 +251,11 @@ def motion(plant: Plant, seconds: float, rng: np.random.Generator) -> tuple[Arra
     dq, ddq, sign = np.zeros_like(q), np.zeros_like(q), np.empty_like(q)
     at, z, k = centre.copy(), np.zeros(arm.n), 0
     while k < count:
-        lasts = rng.uniform(0.8, 3.0)
+        way = centre + rng.uniform(-0.6, 0.6, arm.n) - at
+        lasts = max(rng.uniform(0.8, 3.0), 1.875 * float(np.abs(way).max()) / FASTEST)
         rows = min(max(int(lasts * RATE), 1), count - k)
         s = slice(k, k + rows)
         x = (np.arange(1, rows + 1) / (lasts * RATE))[:, None]
-        goal = centre + rng.uniform(-0.6, 0.6, arm.n)
-        way = goal - at
         q[s] = at + way * (10.0 * x**3 - 15.0 * x**4 + 6.0 * x**5)
         dq[s] = way * (30.0 * x**2 - 60.0 * x**3 + 30.0 * x**4) / lasts
         ddq[s] = way * (60.0 * x - 180.0 * x**2 + 120.0 * x**3) / lasts**2
@@ -304,6 +305,7 @@ def simulate(job: Job) -> tuple[Log, float]:
     level = wrong * (coulomb + excess + np.array([x.load for x in f]) * np.abs(gear))
     torque = rigid + level * sign + dq * [x.viscous for x in f] + np.array([x.offset for x in f])
     torque += wander(np.array(plant.model_std), plant.model_time, len(q), rng)
+    torque[1:] = 0.5 * (torque[1:] + torque[:-1])  # a sample's torque is that of the period before it
     touched = math.nan
     if job.rise > 0.0:
         row = int((0.5 + 0.2 * rng.random()) * len(q))
