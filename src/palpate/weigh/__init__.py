@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .proposal import TwoWayMotion, two_way_motion
 from .replay import Difference, Replay, replay
 from .scenes import Scene, find_pose, load_arm, scene, telling_pose, weight_torque
 from .session import Moment, Session, Task, arm_of, arrival, brick, check_mass, run
@@ -15,6 +16,7 @@ __all__ = [
     "Scene",
     "Session",
     "Task",
+    "TwoWayMotion",
     "Weighing",
     "arm_of",
     "arrival",
@@ -30,6 +32,7 @@ __all__ = [
     "run",
     "scene",
     "telling_pose",
+    "two_way_motion",
     "weigh_log",
     "weigh_session",
     "weight_torque",
