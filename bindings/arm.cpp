@@ -24,7 +24,7 @@ std::shared_ptr<Arm> make_arm(int n, const Stack& T, const Rows& axis, const Fla
   expect(axis.shape(0) == rows && axis.shape(1) == 3, "axis: expected shape (n, 3)");
   expect(com.shape(0) == rows && com.shape(1) == 3, "com: expected shape (n, 3)");
   expect(inertia.shape(0) == rows && inertia.shape(1) == 3 && inertia.shape(2) == 3, "inertia: expected shape (n, 3, 3)");
-  expect(friction.shape(0) == rows && friction.shape(1) == 7, "friction: expected shape (n, 7)");
+  expect(friction.shape(0) == rows && friction.shape(1) == 8, "friction: expected shape (n, 8)");
   expect(limits.shape(0) == rows && limits.shape(1) == 4, "limits: expected shape (n, 4)");
   expect(sensing.shape(0) == rows && sensing.shape(1) == 6, "sensing: expected shape (n, 6)");
   expect(prismatic.shape(0) == rows && mass.shape(0) == rows && rotor.shape(0) == rows && gain.shape(0) == rows, "expected one number per joint");
@@ -44,8 +44,8 @@ std::shared_ptr<Arm> make_arm(int n, const Stack& T, const Rows& axis, const Fla
     const double* I = inertia.data() + 9 * j;
     J.inertia = {I[0], I[1], I[2], I[4], I[5], I[8]};
     J.rotor_inertia = rotor.data()[j];
-    const double* f = friction.data() + 7 * j;
-    J.friction = {f[0], f[1], f[2], f[3], f[4], f[5], f[6]};
+    const double* f = friction.data() + 8 * j;
+    J.friction = {f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7]};
     const double* l = limits.data() + 4 * j;
     J.lower = l[0], J.upper = l[1], J.max_velocity = l[2], J.max_effort = l[3];
     const double* s = sensing.data() + 6 * j;

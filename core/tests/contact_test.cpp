@@ -214,6 +214,17 @@ TEST(Contact, ASoftContactIsFoundBeforeItIsHard) {
   EXPECT_EQ(found.released_ns, 0);  // it lasts
 }
 
+TEST(Contact, EndsForAJointTooThatFeltItLate) {  // its model's error had taken the push: let go is no new contact
+  const Arm arm(description(3));
+  Scene scene{.error_std = 0.05};
+  scene.push = [](double t, const JointVector&) { return t > 2.0 && t < 2.5 ? JointVector{12.0, 5.0, 0.0} : JointVector{}; };
+  for (double slow : {0.3, 1.0, 3.0}) {
+    const Found found = detect(arm, scene, {.model_std = {0.1, slow, 0.1}, .friction_fraction = 0.0}, 4.0);
+    EXPECT_EQ(found.count, 1u) << slow;
+    EXPECT_NEAR(static_cast<double>(found.released_ns) * 1e-9, 2.5, 0.15) << slow;
+  }
+}
+
 TEST(Contact, ReversalsAreNone) {
   const Arm arm(description(4));
   for (double error : {0.0, 0.3, -0.3})  // true dry friction, a third off, where the model has a smooth sign

@@ -122,4 +122,95 @@ TEST(SignTravel, NoiseAtRestAndSpeedInMotionAreNone) {
   EXPECT_EQ(sum, 0.0);
 }
 
+/// A path x(t), its excess and all friction of it.
+struct Path {
+  Friction friction;
+  FrictionHistory history{};
+  double x = 0.0, dq = 0.0;
+  double go(double distance, double speed, double tau = 0.0) {  // the last excess
+    const double h = 1e-3;
+    const int steps = static_cast<int>(std::round(std::abs(distance) / (std::abs(speed) * h)));
+    double excess = 0.0;
+    dq = distance > 0.0 ? speed : -speed;
+    for (int k = 0; k < steps; ++k) excess = history.step(friction, x += dq * h, 0.0, dq, tau);
+    return excess;
+  }
+};
+
+TEST(FrictionHistory, IsNothingWithoutMemoryAndLoad) {
+  Friction f = full;
+  f.load = 0.0;
+  Path path{f};
+  for (double d : {0.1, -0.2, 0.003}) EXPECT_EQ(path.go(d, 0.05, 20.0), 0.0);
+}
+
+TEST(FrictionHistory, FarFromAReversalItIsCoulomb) {
+  Friction f = plain;
+  f.presliding = 1e-3;
+  for (double v : {0.002, 0.02, 0.5}) {  // slow ones too, where tanh is not yet 1
+    Path path{f};
+    path.go(0.01, v);
+    for (double d : {-0.02, 0.02}) {
+      const double sign = d > 0.0 ? 1.0 : -1.0;
+      const double total = path.go(d, v) + f.torque(path.dq);
+      EXPECT_NEAR(total, 1.2 * sign + f.viscous * path.dq + f.offset, 2e-3) << v;
+    }
+  }
+}
+
+TEST(FrictionHistory, HoldsAtRestHoweverLongAndNoisy) {
+  Friction f = plain;
+  f.presliding = 1e-3;
+  Path path{f};
+  path.go(-0.02, 0.1);
+  double excess = 0.0;
+  for (int k = 0; k < 100000; ++k) {
+    excess = path.history.step(f, path.x + 2e-5 * (k % 3 - 1), 1e-5, 0.0, 0.0);
+    if (k > 1) ASSERT_NEAR(excess, -1.2, 0.06) << k;  // within the noise it is a spring: 1.2 (1 - exp(-0.04))
+  }
+}
+
+TEST(FrictionHistory, TurnsOverWithTravelNotWithTime) {
+  Friction f = plain;
+  f.presliding = 1e-3;
+  for (double v : {0.01, 1.0}) {
+    Path path{f};
+    path.go(0.02, v);
+    path.go(-1e-3 * std::log(2.0), v);
+    EXPECT_NEAR(path.history.sign(), 0.0, v > 0.5 ? 0.6 : 0.05) << v;  // half of the way from 1 to -1, to a sample
+  }
+}
+
+TEST(FrictionHistory, IsPassive) {  // over any closed path friction takes energy, never gives
+  Friction f = plain;
+  f.presliding = 2e-3;
+  f.offset = 0.0;
+  for (double amplitude : {2e-4, 1e-3, 1e-2, 0.3}) {
+    FrictionHistory history;
+    double work = 0.0, last = 0.0;
+    const int period = 20000;
+    for (int k = 0; k < 4 * period; ++k) {
+      const double w = 2.0 * std::numbers::pi / period, x = amplitude * std::sin(w * k), dq = amplitude * w * 1e3 * std::cos(w * k);
+      const double torque = history.step(f, x, 0.0, dq, 0.0) + f.torque(dq);
+      if (k >= 3 * period) work += torque * (x - last);
+      last = x;
+    }
+    EXPECT_GT(work, 0.0) << amplitude;
+  }
+}
+
+TEST(FrictionHistory, CarriesTheLoadsPart) {
+  Friction f = plain;
+  f.load = 0.05;
+  for (double presliding : {0.0, 1e-3}) {
+    f.presliding = presliding;
+    Path path{f};
+    for (double d : {0.2, -0.2}) {
+      const double sign = d > 0.0 ? 1.0 : -1.0, gear = 80.0;
+      const double friction = (1.2 + 0.05 * gear) * sign + f.viscous * 0.5 * sign + f.offset;
+      EXPECT_NEAR(path.go(d, 0.5, gear + friction) + f.torque(path.dq), friction, 1e-9);
+    }
+  }
+}
+
 }  // namespace

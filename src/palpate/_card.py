@@ -61,6 +61,7 @@ class _Friction(_Model):
     stribeck_velocity_rad_s: _Finite | None = None
     load: _Finite = 0.0
     sign_velocity_rad_s: _Finite = Friction().sign_velocity
+    presliding_rad: _Finite = 0.0
 
 
 class _Limits(_Model):
@@ -289,6 +290,7 @@ def _to_arm(card: _Card) -> Arm:
                         stribeck_velocity=f.stribeck_velocity_rad_s,
                         load=f.load,
                         sign_velocity=f.sign_velocity_rad_s,
+                        presliding=f.presliding_rad,
                     ),
                     limits=Limits(x.lower_rad, x.upper_rad, x.velocity_rad_s, x.effort_Nm),
                     sensing=Sensing(
@@ -422,6 +424,7 @@ def _joint(joint: Joint) -> dict[str, Any]:
             stribeck_velocity_rad_s=f.stribeck_velocity,
             load=f.load,
             sign_velocity_rad_s=f.sign_velocity,
+            presliding_rad=f.presliding,
         )
     )
     parts["limits"] = _differing(

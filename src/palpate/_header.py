@@ -50,6 +50,7 @@ def _joint(joint: Joint, gain: float) -> list[str]:
         ("stribeck_velocity", f.stribeck_velocity),
         ("load", f.load),
         ("sign_velocity", f.sign_velocity),
+        ("presliding", f.presliding),
     )
     fields = {
         "prismatic": "true" if joint.kind == "prismatic" else "false",

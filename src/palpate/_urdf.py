@@ -6,7 +6,8 @@ of the file, ``<palpate>``, which other readers skip::
     <palpate version="1" base="base_link" tip="tool0" gravity="0 0 -9.81" grasp="0 0 0.1">
       <effort kind="current" k_t="0.05 0.05" gear="100 -100"/>
       <joint name="shoulder" rotor_inertia="0.4">
-        <friction offset="0.1" static="3" stribeck_velocity="0.01" load="0" sign_velocity="0.01"/>
+        <friction offset="0.1" static="3" stribeck_velocity="0.01" load="0" sign_velocity="0.01"
+                  presliding="0.001"/>
         <sensing position_resolution="0.0015" position_std="0.002" torque_resolution="0.01" torque_std="0"/>
       </joint>
       <provenance key="source">data sheet, 2024</provenance>
@@ -554,7 +555,7 @@ class _Extra:
             values = {"viscous": dynamics.number("damping", 0.0), "coulomb": dynamics.number("friction", 0.0)}
         more = self.part(joint, "friction")
         if more is not None:
-            keys = ("offset", "static", "stribeck_velocity", "load", "sign_velocity")
+            keys = ("offset", "static", "stribeck_velocity", "load", "sign_velocity", "presliding")
             more.only(keys)
             values |= {k: more.number(k) for k in keys if k in more.attributes}
         try:
@@ -896,7 +897,7 @@ def _extra_lines(arm: Arm) -> list[str]:
                 "friction",
                 joint.friction,
                 Friction(),
-                ("offset", "static", "stribeck_velocity", "load", "sign_velocity"),
+                ("offset", "static", "stribeck_velocity", "load", "sign_velocity", "presliding"),
             ),
             ("sensing", joint.sensing, Sensing(), Sensing.__dataclass_fields__),
         ):

@@ -132,10 +132,13 @@ class Friction:
     """growth of F_c with the joint's load torque [1], >= 0"""
     sign_velocity: float = 1e-2
     """width of the smooth sign [rad/s], > 0"""
+    presliding: float = 0.0
+    """x_0: travel over which the sign turns over after a reversal, and which it is kept for at rest [rad], >= 0;
+    0: no memory. The pipeline remembers; `Arm.friction_torque` has no past and takes the smooth sign"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        for name in ("coulomb", "viscous", "load"):
+        for name in ("coulomb", "viscous", "load", "presliding"):
             put(self, name, _number(getattr(self, name), f"friction {name}", low=0.0))
         put(self, "offset", _number(self.offset, "friction offset"))
         put(self, "sign_velocity", _number(self.sign_velocity, "friction sign_velocity", above=0.0))
@@ -772,6 +775,7 @@ class Arm(_Record):
                 optional(f.stribeck_velocity),
                 f.load,
                 f.sign_velocity,
+                f.presliding,
             )
             for f in (j.friction for j in joints)
         ]

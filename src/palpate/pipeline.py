@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, cast
 
 import numpy as np
@@ -165,7 +165,9 @@ class Contact:
                     link=int(self.link[last]),
                     farthest=int(self.farthest[clearest]),
                     tip=bool(self.tip[clearest]),
+                    clearest=int(clearest),
                     torque=np.array(self.torque[clearest]),
+                    std=np.array(self.std[clearest]),
                 )
             )
         return found
@@ -187,8 +189,12 @@ class ContactEvent:
     """the farthest link on which one force would explain what all joints feel"""
     tip: bool
     """a force at the grasp point would explain it"""
+    clearest: int
+    """row of the run in which it shows best, in standard deviations"""
     torque: Array
-    """(n,) [N m] at its clearest sample"""
+    """(n,) [N m] in that row"""
+    std: Array
+    """(n,) its standard deviation [N m]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -466,3 +472,112 @@ def tare(arm: Arm, log: Log, *, mass_std: float = 0.2) -> Tare:
 def status_names(codes: npt.ArrayLike) -> list[str]:
     """Names of Status values."""
     return [Status(int(c)).name for c in np.atleast_1d(np.asarray(codes))]
+
+
+@dataclass(frozen=True, slots=True)
+class ContactNoise:
+    """What a model gets wrong while nothing touches the arm; the false-alarm rate holds where this holds."""
+
+    torque_std: Array
+    """(n,) white error of the torque, per sample [N m]"""
+    velocity_std: Array | None
+    """(n,) white error of the measured velocity [rad/s]; None: velocity is not measured"""
+    model_std: Array
+    """(n,) slow error of the model in motion [N m]"""
+    model_time: float
+    """how long such an error lasts [s]"""
+
+    def arm(self, arm: Arm) -> Arm:
+        """`arm` with these errors in its sensing; of velocity at least 1e-4 rad/s, so that none counts as exact."""
+        joints = []
+        for j, joint in enumerate(arm.joints):
+            velocity = None if self.velocity_std is None else max(float(self.velocity_std[j]), 1e-4)
+            sensing = replace(
+                joint.sensing,
+                torque_std=float(self.torque_std[j]),
+                velocity_std=velocity,
+                torque_resolution=0.0,
+            )
+            joints.append(joint.replace(sensing=sensing))
+        return arm.replace(joints=tuple(joints))
+
+    def detector(self, **options: Any) -> ContactDetector:
+        """A detector for :meth:`arm`; friction in motion is part of `model_std`. Options are ContactDetector's."""
+        own = {
+            "model_std": self.model_std.tolist(),
+            "model_time": self.model_time,
+            "friction_fraction": 0.0,
+        }
+        return ContactDetector(**{**own, **options})
+
+
+def contact_noise(arm: Arm, logs: Iterable[Log]) -> ContactNoise:
+    """Measure a model's errors in logs of free motion, for contact detection with a rate one can state.
+
+    The one-step torque residual of the momentum is split by its autocovariance C(lag), over samples where the joint
+    moves: a slow error s^2 exp(-lag/T), fitted from the second lag on; noise of the velocity, which enters as a
+    difference and makes C(1) smaller by its variance; white torque noise, the rest of C(0). Residuals beyond five
+    median deviations count as five.
+
+    Args:
+        arm: with the dynamics and friction to be used later.
+        logs: free motion of every joint in both directions, nothing held, nothing touched.
+
+    Raises:
+        InputError: a log does not fit the arm, or a joint moves for fewer than 500 samples.
+    """
+    lags = 64
+    product, count = np.zeros((arm.n, lags)), np.zeros((arm.n, lags))
+    inertia, period, poses = np.zeros((arm.n, arm.n)), [], 0
+    measured = True
+    still = [3.0 * j.friction.sign_velocity for j in arm.joints]
+    for log in logs:
+        raw = Pipeline(arm, observer=MomentumObserver(bandwidth=1e6), payload=None).run(log)
+        measured = measured and log.velocity is not None
+        good = raw.external.status == int(Status.ok.value)
+        residual, speed = raw.external.torque, np.abs(raw.dq)
+        for j in range(arm.n):
+            use = good & (speed[:, j] > still[j])
+            if np.count_nonzero(use) < 2:
+                continue
+            x = residual[:, j] - np.median(residual[use, j])
+            limit = 5.0 * 1.4826 * np.median(np.abs(x[use]))
+            x = np.clip(residual[:, j], *(np.median(residual[use, j]) + np.array([-limit, limit])))
+            for lag in range(lags):
+                both = use[lag:] & use[: len(use) - lag]
+                product[j, lag] += (x[lag:] * x[: len(x) - lag])[both].sum()
+                count[j, lag] += np.count_nonzero(both)
+        period.append(np.diff(log.time_ns) * 1e-9)
+        sampled = arm.mass_matrix(np.ascontiguousarray(log.position[:: max(1, len(log) // 100)]))
+        inertia += np.square(sampled).sum(axis=0)
+        poses += len(sampled)
+    seldom = [arm.joints[j].name for j in range(arm.n) if count[j, 0] < 500]
+    if seldom:
+        raise InputError(
+            f"contact noise: {', '.join(seldom)} moves for fewer than 500 samples; add a log where it moves"
+        )
+    h = float(np.median(np.concatenate(period)))
+    covariance = product / np.maximum(count, 1.0)
+    lag_time = np.arange(2, lags) * h
+    times = np.geomspace(5.0 * h, 50.0 * lags * h, 40)
+    slow, time = np.zeros(arm.n), np.zeros(arm.n)
+    for j in range(arm.n):
+        shapes = np.exp(-lag_time / times[:, None])
+        scale = np.maximum(shapes @ covariance[j, 2:] / np.square(shapes).sum(axis=1), 0.0)
+        best = int(np.square(covariance[j, 2:] - scale[:, None] * shapes).sum(axis=1).argmin())
+        slow[j], time[j] = scale[best], times[best]
+    model_time = float(np.median(time))
+    difference = np.maximum(slow * np.exp(-h / time) - covariance[:, 1], 0.0) if measured else np.zeros(arm.n)
+    white = np.maximum(covariance[:, 0] - slow - 2.0 * difference, 1e-4 * covariance[:, 0])
+    velocity = np.sqrt(_non_negative(inertia / poses / h**2, difference)) if measured else None
+    return ContactNoise(np.sqrt(white), velocity, np.sqrt(slow), model_time)
+
+
+def _non_negative(A: Array, b: Array) -> Array:
+    """x >= 0 (n,) that minimises |A x - b|, for A (n, n) and b (n,) without negative entries; by coordinates."""
+    x = np.zeros(A.shape[1])
+    for _ in range(2000):
+        for k in range(len(x)):
+            column = A[:, k]
+            x[k] = max(0.0, x[k] + column @ (b - A @ x) / (column @ column))
+    return x

@@ -49,6 +49,7 @@ def pendulum(**changes: object) -> Arm:
         (lambda: Friction(static=1), "static and stribeck_velocity together"),
         (lambda: Friction(static=1, stribeck_velocity=0), "stribeck_velocity must be > 0"),
         (lambda: Friction(sign_velocity=0), "sign_velocity must be > 0"),
+        (lambda: Friction(presliding=-1e-3), "presliding must be >= 0"),
         (lambda: Sensing(position_std=-1e-3), "sensing position_std must be >= 0"),
         (lambda: Sensing(velocity_std=math.inf), "sensing velocity_std must be finite"),
         (lambda: Limits(lower=1, upper=0), r"lower must not exceed upper, got \[1.0, 0.0\]"),

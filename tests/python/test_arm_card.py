@@ -46,6 +46,7 @@ def arms(draw) -> Arm:
                     *(stribeck or (None, None)),
                     load=draw(positive),
                     sign_velocity=draw(above),
+                    presliding=draw(above),
                 ),
                 limits=draw(
                     st.just(Limits()) | st.builds(Limits, st.just(lower), st.just(upper), above, above)

@@ -96,7 +96,12 @@ def test_random_arms_survive_the_way_through_urdf(seed):
         j.replace(
             rotor_inertia=rng.uniform(0, 1),
             friction=Friction(
-                *rng.uniform(0, 1, 3), static=2, stribeck_velocity=0.1, load=0.2, sign_velocity=0.3
+                *rng.uniform(0, 1, 3),
+                static=2,
+                stribeck_velocity=0.1,
+                load=0.2,
+                sign_velocity=0.3,
+                presliding=0.4,
             ),
             sensing=Sensing(*rng.uniform(0, 1, 6)),
         )

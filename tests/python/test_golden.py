@@ -31,6 +31,13 @@ PIPELINES = {
     "super-twisting + regression m, mc": lambda arm: pp.Pipeline(
         arm, observer=pp.MomentumSuperTwisting(), payload=pp.Regression(first_moment=True)
     ),
+    "disturbance-kalman, wrench, contact": lambda arm: pp.Pipeline(
+        arm,
+        observer=pp.DisturbanceKalman(),
+        payload=None,
+        wrench=pp.WrenchEstimator(),
+        contact=pp.ContactDetector(),
+    ),
     "extended-kalman": lambda arm: pp.Pipeline(arm, observer=pp.ExtendedKalman(), payload=None),
     "payload-filter m": lambda arm: pp.Pipeline(arm, payload=pp.PayloadFilter()),
     "payload-filter m, mc": lambda arm: pp.Pipeline(arm),
@@ -81,6 +88,10 @@ def outputs() -> dict[str, dict[str, list[float]]]:
             "status": [int(touch.payload.status[r]) for r in ROWS],
             "q": [float(x) for r in ROWS for x in touch.q[r]],
         }
+        if touch.wrench is not None and touch.contact is not None:
+            out[name]["force"] = [float(x) for r in ROWS for x in touch.wrench.force[r]]
+            out[name]["force_std"] = [float(x) for r in ROWS for x in touch.wrench.force_std[r]]
+            out[name]["level"] = [float(x) for r in ROWS for x in touch.contact.level[r]]
     return out
 
 

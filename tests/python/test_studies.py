@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import math
 import os
@@ -23,6 +24,7 @@ from palpate.studies import (
     _bound,
     _figures,
     _rows,
+    contacts,
     grasp_and_release,
     mass_estimation,
     payload_filter,
@@ -482,3 +484,43 @@ def test_grasp_during_a_motion_is_seen(arm):
     motion = _bench.simulate(arm, PublishedLaw(arm), POSES["goal"], schedule=schedule, seconds=6.0)
     payload = motion.weigh(Pipeline(arm)).payload
     assert payload.changes[-1] >= 1 and payload.mass[-1] == pytest.approx(MASS, rel=0.02)
+
+
+# --- contacts ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_contact_campaign_counts_and_times():
+    plant = contacts.iiwa()
+    assert contacts.measure(contacts.Job(plant, 60.0, 1)) == contacts.measure(contacts.Job(plant, 60.0, 1))
+    assert contacts.measure(contacts.Job(plant, 60.0, 1)).contacts == 0
+    hard = [
+        contacts.measure(contacts.Job(plant, 4.0, k, contacts.HARD, contacts.HARD_MOST)) for k in range(5)
+    ]
+    soft = [contacts.measure(contacts.Job(plant, 4.0, k, contacts.SOFT, 150.0)) for k in range(5)]
+    assert not any(f.early for f in hard + soft)
+    assert max(f.delay for f in hard) <= 0.005
+    assert 0.005 < np.median([f.delay for f in soft]) <= 0.030
+
+
+def test_the_contact_campaign_would_see_false_alarms():
+    """A detector that is told a tenth of the errors alarms all the time: the count of none is no artefact."""
+    plant = contacts.iiwa()
+    told = dict(plant.options) | {"model_std": [0.03] * 7, "friction_fraction": 0.03}
+    deceived = dataclasses.replace(plant, options=tuple(told.items()))
+    assert contacts.measure(contacts.Job(deceived, 60.0, 1)).contacts > 3
+
+
+def test_the_contact_campaign_is_what_it_is_said_to_be():
+    plant, rng = contacts.iiwa(), np.random.default_rng(0)
+    q, dq, ddq, sign = contacts.motion(plant, 60.0, rng)
+    assert np.abs(np.gradient(q, 1.0 / contacts.RATE, axis=0) - dq)[2:-2].max() < 0.02
+    assert np.abs(np.gradient(dq, 1.0 / contacts.RATE, axis=0) - ddq)[2:-2].max() < 0.2
+    assert np.abs(sign).max() <= 1.0
+    rest = (dq == 0.0).all(axis=1)
+    assert 0.05 < rest.mean() < 0.4
+    slow = contacts.wander(np.full(7, 0.5), 1.0, 400_000, rng)
+    assert np.allclose(slow.std(axis=0), 0.5, rtol=0.25)
+    step = slow[1000:] * slow[:-1000]  # one correlation time later
+    assert np.allclose(step.mean(axis=0) / slow.var(axis=0), np.exp(-1.0), atol=0.2)
+    log, touched = contacts.simulate(contacts.Job(plant, 4.0, 3, contacts.SOFT, 150.0))
+    assert 2.0 <= touched <= 2.8 and len(log) == 4000

@@ -474,3 +474,66 @@ def test_a_pipeline_of_another_arm_is_refused() -> None:
     task = W.Task(scene=scene, start=scene.poses["Zero"], poses=(scene.poses["Take3"],))
     with pytest.raises(pp.InputError, match="made for the task's arm"):
         W.run(task, pp.Pipeline(pp.robots.load("justina_left_arm_box")))
+
+
+def resting(arm: pp.Arm, seconds: float, rate: float, mass: float) -> pp.Log:
+    """Nothing moves; the drives hold a mass and, within stiction, less or more."""
+    rows = int(seconds * rate)
+    q = np.tile([0.0, 0.6, 0.0, -1.2, 0.0, 0.7, 0.0], (rows, 1))
+    weight = arm.jacobian(q[0], point=arm.grasp)[:3].T @ np.array([0.0, 0.0, -9.81 * mass])
+    rng = np.random.default_rng(1)
+    return pp.Log(
+        time_ns=(np.arange(rows) * (1e9 / rate)).round().astype(np.int64),
+        position=q,
+        velocity=rng.normal(0.0, 1e-4, q.shape),
+        effort=arm.gravity_torque(q) - weight + rng.normal(0.0, 0.1, q.shape),
+        joint_names=arm.joint_names,
+    )
+
+
+def test_where_stiction_hides_the_weight_a_two_way_motion_is_proposed():
+    arm = pp.robots.load("kuka_lbr_iiwa14")
+    friction = pp.Friction(coulomb=6.0, viscous=1.0, presliding=2e-3)
+    sensing = pp.Sensing(position_std=1e-5, velocity_std=1e-4, torque_std=0.1)
+    joints = tuple(j.replace(friction=friction, sensing=sensing) for j in arm.joints)
+    arm = arm.replace(joints=joints, effort=pp.Effort.torque())
+    for rate in (100.0, 500.0):
+        log = resting(arm, 4.0, rate, 1.0)
+        found = W.weigh_log(log, arm)
+        motion = found.proposal
+        assert motion is not None
+        j = arm.joint_names.index(motion.joint)
+        assert motion.start == log.position[-1, j] and abs(motion.stop - motion.start) >= 0.05
+        assert arm.joints[j].limits.lower <= motion.stop <= arm.joints[j].limits.upper
+        assert motion.hidden == pytest.approx(6.0 / W.weight_torque(arm, log.position[-1])[j])
+        assert motion.hidden < 2.0 * 1.96 * found.mass_std * 7**0.5
+        assert any(motion.joint in r and "and back, twice" in r for r in found.remarks)
+        assert found.summary()["proposal"] == motion.summary()
+    smooth = tuple(j.replace(friction=pp.Friction(viscous=1.0)) for j in arm.joints)
+    assert W.weigh_log(resting(arm, 4.0, 500.0, 1.0), arm.replace(joints=smooth)).proposal is None
+
+
+def test_a_proposal_keeps_to_the_limits():
+    arm = pp.robots.load("kuka_lbr_iiwa14")
+    joints = tuple(j.replace(friction=pp.Friction(coulomb=6.0)) for j in arm.joints)
+    arm = arm.replace(joints=joints)
+    q = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 0.7, 0.0])
+    first = W.two_way_motion(arm, q)
+    assert first is not None
+    j = arm.joint_names.index(first.joint)
+    tight = arm.joints[j].replace(limits=pp.Limits(q[j] - 0.01, q[j] + 0.01, 1.0, 100.0))
+    other = W.two_way_motion(arm.replace(joints=(*joints[:j], tight, *joints[j + 1 :])), q)
+    assert other is not None and other.joint != first.joint
+    edge = arm.joints[j].replace(limits=pp.Limits(q[j] - 1.0, q[j] + 0.01, 1.0, 100.0))
+    back = W.two_way_motion(arm.replace(joints=(*joints[:j], edge, *joints[j + 1 :])), q)
+    assert back is not None and back.joint == first.joint and back.stop < back.start
+
+
+def test_a_slow_log_is_weighed_by_regression_and_no_filter():
+    arm = pp.robots.load("kuka_lbr_iiwa14").replace(effort=pp.Effort.torque())
+    log = resting(arm, 4.0, 100.0, 1.0)
+    found = W.weigh_log(log, arm)
+    assert found.pipeline["payload"]["name"] == "regression" and found.pipeline["payload"]["first_moment"]
+    assert any("below 200 Hz" in r for r in found.remarks)
+    with pytest.raises(pp.InputError, match="at least 200 samples per second, the log has 100"):
+        W.weigh_log(log, arm, estimator="payload-filter")

@@ -211,4 +211,31 @@ class Arm {
   bool has_dynamics_ = false;
 };
 
+/// FrictionHistory of every joint: takes out of a sample's torque what friction is beyond a function of the velocity, so that
+/// no observer need remember anything.
+class FrictionMemory {
+ public:
+  void step(const Arm& arm, JointSample& s) noexcept {
+    if (s.status == Status::non_finite || s.status == Status::time_error) return;
+    for (int j = 0; j < arm.n(); ++j) {
+      const auto u = static_cast<std::size_t>(j);
+      const JointDescription& d = arm.joint(j);
+      if (s.dt > 0.0 && started_) ddq_[u] += -std::expm1(-s.dt / rotor_time) * ((s.dq[u] - dq_[u]) / s.dt - ddq_[u]);
+      dq_[u] = s.dq[u];
+      const double gear = s.tau[u] - d.rotor_inertia * ddq_[u];
+      const double excess = joints_[u].step(d.friction, s.q[u], std::sqrt(arm.position_variance(j)), s.dq[u], gear);
+      s.friction_excess[u] = excess;
+      s.tau[u] -= excess;
+    }
+    started_ = s.status == Status::ok;
+  }
+
+ private:
+  static constexpr double rotor_time = 0.02;  // time constant of the acceleration that the rotors take [s]
+
+  std::array<FrictionHistory, max_joints> joints_{};
+  JointVector dq_{}, ddq_{};
+  bool started_ = false;
+};
+
 }  // namespace palpate

@@ -10,7 +10,7 @@ namespace palpate {
 /// Where the detector takes its residual from.
 enum class ContactSource : std::uint8_t {
   momentum = 0,        ///< generalised momentum and the arm's own model
-  model_residual = 1,  ///< the controller's bare-arm torque less the measured one; needs no masses
+  model_residual = 1,  ///< the controller's bare-arm torque and the friction, less the measured torque; needs no masses
 };
 
 struct ContactConfig {
@@ -32,19 +32,20 @@ struct ContactConfig {
 ///
 /// Untouched, a joint obeys  p' = tau + C^T q' - g - tau_f + tau_L + b + w,  z = p + noise of q' seen through M, where b is what
 /// the model gets wrong: not white, but a process whose size and correlation time depend on the motion,
-///   V = rho F^2/3 + (1 - rho) (friction_fraction F_c)^2 + model_std^2 + (torque_gain_std tau)^2 + Var(tau_L)_j,
+///   V = rho ((1 + friction_fraction) F)^2/3 + (1 - rho) (friction_fraction F_c)^2 + model_std^2 + (torque_gain_std tau)^2 + Var(tau_L)_j,
 ///   1/T = rho/rest_time + (1 - rho)/model_time,      rho = max(1 - tanh^2(q'/v_0), what it was, fading with settle_time):
 /// slow and small in motion; at rest anything within stiction +-F, and quick, as a drive may load its gear at any time without
-/// moving it; and so for a moment after rest, until friction has settled. Within +-sqrt(3 V) (+-F at rest) b walks at random,
-/// 2 V/T per second (to any place at once while the direction of motion is not sure), and may stay where it is; beyond it stiction drives it no further and it returns with time constant T, or
-/// a contact has brought it there. A turn of the sign renews it (SignTravel). So reversals, starts and stops are no contacts.
+/// moving it; and so for a moment after rest, until friction has settled. Within +-sqrt(3 V), at rest stiction and two deviations
+/// of the slow errors, b walks at random, 2 V/T per second (to any place at once while the direction of motion is not sure), and
+/// may stay where it is; beyond it stiction drives it no further and it returns with time constant T, or a contact has brought
+/// it there. A turn of the sign renews it (SignTravel). So reversals, starts and stops are no contacts.
 /// A Kalman filter of two states per joint, (p, b), takes all that is expected out of z; what is left, e = innovation/std, is
 /// white with variance 1 as long as nothing touches the arm. Then for kappa = 1/4, 1/2, 1, 2, from soft contacts to hard ones,
 ///   g+ <- max(0, g+ + e - kappa),  g- <- max(0, g- - e - kappa),  alarm at g > h(kappa).
 /// The thresholds follow from the rate by Siegmund's approximation of the mean time between false alarms of one sum,
 ///   ARL = (exp(x) - x - 1)/(2 kappa^2) samples,  x = 2 kappa (h + 1.166),   ARL = 8 n 3600/(rate dt),
 /// n joints with eight sums each, which share the rate; contact_test.cpp counts alarms. With model_residual,
-/// z = tau_model - tau = b + w.
+/// z = tau_model + tau_f - tau = b + w. Where friction remembers (FrictionHistory), stiction lies around what it remembers.
 ///
 /// The onset is when the alarmed sum last left zero. From then on b of an alarmed joint is kept and what the joint feels beyond
 /// it is the contact's torque c, until it has been within three standard deviations, or stiction, for release_time.
@@ -125,13 +126,16 @@ class ContactDetector {
     std::array<Sum, 8> sums{};                   // g+ and g- of every drift
     double z = 0.0;                              // last measurement
     double fast = 0.0, fast_variance = 0.0;      // low-passed one-step torque, and its noise
-    double base = 0.0;                           // b at the onset: what is no contact
-    double growth = 0.0;                         // variance the model error may have gained since, but for stiction
-    double bound = 0.0;                          // sqrt(3 V)
+    double base = 0.0;                           // b at the onset of the contact: what is no contact
+    double wandered = 0.0, renewed = 0.0;        // variance of base: as known then and what wandered since; by turns of the sign
+    double bound = 0.0, center = 0.0;            // sqrt(3 V); b at rest lies within center +- bound
     bool feels = false, unsure = true;           // unsure of the direction of motion
     double rest = 0.0, dq = 0.0;                 // rho; q' of the last sample
     double felt = 0.0;                           // how long the joint has felt this contact [s]
     SignTravel travel{};
+
+    /// The part of b that the model's errors may be.
+    double stiction(double x) const noexcept { return std::clamp(x, center - bound, center + bound); }
   };
   struct Measurement {
     JointVector z{}, input{}, beta{}, variance{}, slope{};  // variance of z
@@ -143,7 +147,7 @@ class ContactDetector {
     Measurement m;
     const int n = arm_->n();
     if (config_.source == ContactSource::model_residual) {
-      for (int j = 0; j < n; ++j) m.z[u(j)] = s.model_torque[u(j)] - s.tau[u(j)] - load.torque()[u(j)];
+      for (int j = 0; j < n; ++j) m.z[u(j)] = s.model_torque[u(j)] + arm_->joint(j).friction.torque(s.dq[u(j)]) - s.tau[u(j)] - load.torque()[u(j)];
       return m;
     }
     const MomentumTerms<double> t = momentum_terms<double>(*arm_, s.q, s.dq);
@@ -171,10 +175,12 @@ class ContactDetector {
   double model_variance(int j, const JointSample& s, const LoadTorque& load, double rest) const noexcept {
     const JointDescription& d = arm_->joint(j);
     constexpr double fast = 1e3;  // in units of v_0: motion for certain
-    return rest * rest_variance(j) + (1.0 - rest) * square(d.friction.uncertainty(fast * d.friction.sign_velocity, config_.friction_fraction)) +
+    return rest * rest_variance(j, s) + (1.0 - rest) * square(d.friction.uncertainty(fast * d.friction.sign_velocity, config_.friction_fraction, s.tau[u(j)])) +
            square(config_.model_std[u(j)]) + square(d.torque_gain_std * s.tau[u(j)]) + square(load.std(j)) + 1e-18;
   }
-  double rest_variance(int j) const noexcept { return square(arm_->joint(j).friction.uncertainty(0.0, config_.friction_fraction)); }
+  double rest_variance(int j, const JointSample& s) const noexcept {
+    return square((1.0 + config_.friction_fraction) * arm_->joint(j).friction.uncertainty(0.0, config_.friction_fraction, s.tau[u(j)]));
+  }
   double white_variance(int j) const noexcept { return arm_->torque_variance(j) + square(config_.noise_std[u(j)]) + 1e-18; }
 
   void begin(const JointSample& s, const LoadTorque& load, const Measurement& m) noexcept {
@@ -219,12 +225,13 @@ class ContactDetector {
     J.unsure = unsure;
     J.dq = s.dq[u(j)];
     J.rest = std::max(undirected ? 1.0 : 1.0 - square(std::tanh(s.dq[u(j)] / friction.sign_velocity)), J.rest * std::exp(-h / config_.settle_time));
-    const double V = model_variance(j, s, load, J.rest), V_rest = J.rest * rest_variance(j);
+    const double V = model_variance(j, s, load, J.rest), V_rest = J.rest * rest_variance(j, s);
     const double back = -std::expm1(-h * (J.rest / config_.rest_time + (1.0 - J.rest) / config_.model_time));
-    const double turned = J.travel.step(friction, s.dq[u(j)], s.dq_std[u(j)]) * rest_variance(j);
-    double wander = (V - V_rest) * -std::expm1(-2.0 * h / config_.model_time) + turned;
+    const double turned = J.travel.step(friction, s.dq[u(j)], s.dq_std[u(j)]) * rest_variance(j, s);
+    const double slow = (V - V_rest) * -std::expm1(-2.0 * h / config_.model_time);
     const double quick = undirected ? 4.0 * V_rest : V_rest * -std::expm1(-2.0 * h / config_.rest_time);
-    const double bound = J.bound = std::sqrt(3.0 * V), slow = wander;
+    J.bound = (1.0 - J.rest) * std::sqrt(3.0 * V) + J.rest * (std::sqrt(3.0 * V_rest) + 2.0 * std::sqrt(V - V_rest));
+    J.center = J.rest * s.friction_excess[u(j)];
     const double white = white_variance(j) + 0.5 * square(m.slope[u(j)] * s.dq_std[u(j)]);
     const double input = m.input[u(j)] + 0.5 * (m.beta[u(j)] + beta_[u(j)]);
 
@@ -237,10 +244,11 @@ class ContactDetector {
 
     // Prediction and update of (p, b), or of b alone. Friction at rest is quick up to the bound, not beyond it.
     const double b_before = J.b;
-    J.b -= back * (J.b - std::clamp(J.b, -bound, bound));
+    J.b -= back * (J.b - J.stiction(J.b));
     if (momentum) J.p += h * (input + b_before);
     const double y = momentum ? z - J.p : z - J.b;
-    wander += quick * (y * J.b > 0.0 ? std::max(0.0, 1.0 - square(J.b / bound)) : 1.0);
+    const double off = J.b - J.center;
+    const double wander = slow + turned + quick * (y * off > 0.0 ? std::max(0.0, 1.0 - square(off / J.bound)) : 1.0);
     double S, K_b;
     if (momentum) {
       J.P_pp += h * (2.0 * J.P_pb + h * J.P_bb) + h * h * white;
@@ -266,9 +274,12 @@ class ContactDetector {
       J.P_pp = R;
       J.P_pb = 0.0;
     }
+    if (contact_.active) {
+      J.wandered = std::min(J.wandered + slow, std::max(J.wandered, V - V_rest));
+      J.renewed = std::min(J.renewed + turned, rest_variance(j, s));
+    }
     if (J.feels) {
-      J.b = J.base;  // kept while the contact lasts; the error may wander away from it, as far as V goes
-      J.growth = std::min(J.growth + slow, V + turned);
+      J.b = J.base;  // kept while the contact lasts
       return;
     }
     J.b += K_b * (elapsed_ < config_.warm_up ? y : e * std);
@@ -292,8 +303,7 @@ class ContactDetector {
         if (J.sums[k].g > h_[k / 2] && (first == nullptr || J.sums[k].since_ns > first->since_ns)) first = &J.sums[k];
       if (first == nullptr) continue;
       J.feels = alarm = true;
-      J.base = J.b = J.rest > 0.5 ? std::clamp(first->b, -J.bound, J.bound) : first->b;
-      J.growth = 0.0;
+      if (!contact_.active) J.base = J.rest > 0.5 ? J.stiction(first->b) : first->b;
       onset = std::min(onset, first->since_ns);
     }
     if (alarm && !contact_.active) {
@@ -301,6 +311,12 @@ class ContactDetector {
       ++contact_.count;
       contact_.onset_time_ns = onset;
       contact_.alarm_time_ns = s.time_ns;
+      for (int j = 0; j < n; ++j) {  // a joint that feels it later has taken some of it for its model's error by then
+        JointState& J = joints_[u(j)];
+        if (!J.feels) J.base = J.b;
+        J.wandered = J.P_bb;
+        J.renewed = 0.0;
+      }
     }
     if (!contact_.active) return;
     bool quiet = true;
@@ -312,9 +328,9 @@ class ContactDetector {
     for (int j = 0; j < n; ++j) {
       JointState& J = joints_[u(j)];
       if (!J.feels) continue;
-      const double std = std::sqrt(J.fast_variance + J.growth);
+      const double std = std::sqrt(J.fast_variance + J.wandered + J.renewed);
       // Of a joint at rest anything within the bound may be stiction.
-      const double stiction = J.rest > 0.5 ? J.fast - std::clamp(J.fast, -J.bound, J.bound) : c[u(j)];
+      const double stiction = J.rest > 0.5 ? J.fast - J.stiction(J.fast) : c[u(j)];
       quiet = quiet && std::min(std::abs(c[u(j)]) - 3.0 * std, std::abs(stiction) - 3.0 * std::sqrt(J.fast_variance)) < 0.0;
       double shaken = 0.0;
       for (int i = 0; i < n; ++i)
@@ -335,7 +351,7 @@ class ContactDetector {
       for (int j = 0; j < n; ++j) {  // a new start from what is there now
         JointState& J = joints_[u(j)];
         J.b = J.fast;
-        J.P_bb = J.P_bb + J.fast_variance + J.growth;
+        J.P_bb += J.fast_variance + J.wandered + J.renewed;
         J.P_pb = 0.0;
         J.sums = {};
         J.feels = false;
@@ -372,7 +388,7 @@ class ContactDetector {
     for (int j = 0; j < n; ++j) {
       const JointState& S = joints_[u(j)];
       if (j <= link) J[u(j)] = jacobian_column(*arm_, P, j, x);
-      variance[u(j)] = S.fast_variance + S.growth + S.P_bb + 1e-12;
+      variance[u(j)] = S.fast_variance + S.wandered + S.renewed + S.P_bb + 1e-12;
     }
     Vec3<double> F{};
     double left = 0.0;
@@ -407,7 +423,7 @@ class ContactDetector {
     for (int j = 0; j < arm_->n(); ++j) {
       const JointState& J = joints_[u(j)];
       contact_.torque[u(j)] = contact_.active ? felt_torque(J) : 0.0;
-      contact_.std[u(j)] = std::sqrt(J.fast_variance + J.growth + J.P_bb);
+      contact_.std[u(j)] = std::sqrt(J.fast_variance + J.wandered + J.renewed + J.P_bb);
       double level = J.feels ? 1.0 : 0.0;
       for (std::size_t k = 0; !J.feels && k < J.sums.size(); ++k) level = std::max(level, h_[k / 2] > 0.0 ? J.sums[k].g / h_[k / 2] : 0.0);
       contact_.level[u(j)] = level;

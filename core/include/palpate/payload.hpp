@@ -232,7 +232,7 @@ class Regression {
       slow_dq_[u(j)] = started_ ? slow_dq_[u(j)] + smoothing * (s.dq[u(j)] - slow_dq_[u(j)]) : s.dq[u(j)];
       const JointDescription& d = arm_->joint(j);
       const bool changed = regime_.changed(*arm_, j, s.q[u(j)], slow_dq_[u(j)]);
-      const double rest = d.friction.uncertainty(regime_.at_rest(j) ? 0.0 : 1e3 * d.friction.sign_velocity, config_.friction_fraction);
+      const double rest = d.friction.uncertainty(regime_.at_rest(j) ? 0.0 : 1e3 * d.friction.sign_velocity, config_.friction_fraction, s.tau[u(j)]);
       const double gain = d.torque_gain_std * s.tau[u(j)];
       const double variance = rest * rest + gain * gain;
       const double keep = !started_ || changed ? 0.0 : phi;

@@ -73,6 +73,7 @@ class PayloadFilter {
 
   Payload step(const JointSample& s) noexcept {
     if (s.status == Status::non_finite || s.status == Status::time_error) return report(s, Status::held);
+    tau_ = s.tau;
     if (!started_ || s.status == Status::gap || !(s.dt > 0.0)) {
       if (started_) forget_load();  // it may have been put down meanwhile
       begin(s);
@@ -125,7 +126,7 @@ class PayloadFilter {
   static constexpr std::size_t u(int i) noexcept { return static_cast<std::size_t>(i); }
   static bool has_coulomb(const Arm& arm) noexcept {
     for (int i = 0; i < arm.n(); ++i)
-      if (arm.joint(i).friction.uncertainty(0.0, 0.0) > 0.0) return true;
+      if (arm.joint(i).friction.uncertainty(0.0, 0.0, 1.0) > 0.0) return true;
     return false;
   }
 
@@ -194,7 +195,7 @@ class PayloadFilter {
 
   double bias_variance(int i) const noexcept {
     const double dq = regime_.at_rest(i) ? 0.0 : filter_.dq(i);
-    const double std = filter_.expected_friction(*arm_, i).uncertainty(dq, config_.friction_fraction);
+    const double std = filter_.expected_friction(*arm_, i).uncertainty(dq, config_.friction_fraction, tau_[u(i)]);
     return std * std;
   }
   void redraw_bias(int i) noexcept { filter_.set_parameter(loads_ + i, 0.0, bias_variance(i)); }
@@ -358,7 +359,7 @@ class PayloadFilter {
   Filter filter_;
   std::array<Inertia<double>, 4> unit_;
   static constexpr double least_model_error = 1e-6;  // [N^2 m^2]
-  JointVector torque_variance_{}, surprise_{}, model_error_{};
+  JointVector tau_{}, torque_variance_{}, surprise_{}, model_error_{};
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
   detail::Regime regime_{presliding};

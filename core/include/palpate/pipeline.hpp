@@ -53,6 +53,7 @@ class Pipeline {
       const bool use = s.velocity_measured && std::isfinite(declared);
       s.dq_std[detail::at(j)] = use ? declared : gain * std::sqrt(arm_->position_variance(j));
     }
+    friction_.step(*arm_, s);
     Touch touch;
     touch.time_ns = s.time_ns;
     touch.status = s.status;
@@ -111,6 +112,7 @@ class Pipeline {
   }
 
   void make() {
+    friction_ = {};
     weighed_ = touched_ = false;
     const Arm& arm = *arm_;
     load_.reset();
@@ -187,6 +189,7 @@ class Pipeline {
   std::shared_ptr<const Arm> arm_;
   PipelineConfig config_;
   Conditioner conditioner_;
+  FrictionMemory friction_{};
   std::variant<std::monostate, InverseDynamicsObserver, ModelResidualObserver, SlidingModeObserver, MomentumObserver, MomentumSuperTwisting,
                DisturbanceKalman, ExtendedKalman>
       observer_;

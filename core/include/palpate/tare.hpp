@@ -32,7 +32,9 @@ class Tare {
     }
   }
 
-  Status step(const JointSample& s) noexcept {
+  Status step(const JointSample& raw) noexcept {
+    JointSample s = raw;
+    friction_.step(*arm_, s);
     if (s.status == Status::non_finite || s.status == Status::time_error) return Status::held;
     if (!started_ || s.status == Status::gap || !(s.dt > 0.0)) {
       filter_.start(*arm_, s, config_.velocity_prior_std);
@@ -45,7 +47,7 @@ class Tare {
       const Arm now = arm_->scaled(factor);
       JointVector variance = torque_variance_;
       for (int j = 0; j < n; ++j) {
-        const double friction = arm_->joint(j).friction.uncertainty(filter_.dq(j), 0.3);
+        const double friction = arm_->joint(j).friction.uncertainty(filter_.dq(j), 0.3, s.tau[detail::at(j)]);
         variance[detail::at(j)] += friction * friction;
       }
       filter_.predict(now, {s.tau, variance, Inertia<double>{}, Inertia<double>{}, decay_}, s.dt / steps,
@@ -80,6 +82,7 @@ class Tare {
   Filter filter_;
   JointVector torque_variance_{};
   Filter::Parameters decay_{};
+  FrictionMemory friction_{};
   bool started_ = false;
 };
 

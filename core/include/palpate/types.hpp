@@ -46,7 +46,8 @@ struct JointSample {
   JointVector dq{};             ///< [rad/s], measured or differentiated
   JointVector dq_std{};         ///< its standard deviation [rad/s]; 0 if not known
   bool velocity_measured = false;  ///< dq comes from the driver, not from the positions
-  JointVector tau{};            ///< link-side motor torque [N m], held from the previous sample to this one
+  JointVector tau{};            ///< link-side motor torque [N m], held from the previous sample to this one; less friction_excess
+  JointVector friction_excess{};  ///< friction beyond Friction::torque(dq), already taken out of tau [N m] (FrictionHistory)
   JointVector model_torque{};   ///< [N m]; read only if has_model_torque
   bool has_model_torque = false;
   Status status = Status::warming;

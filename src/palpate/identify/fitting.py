@@ -573,7 +573,7 @@ def identified(
         if problem.model.stribeck:
             static = max(0.0, coulomb + value("stribeck"))
             velocity = problem.shape.stribeck_velocity[i]
-        # the card's friction has no memory: its smooth sign is made as narrow as the speeds seen allow
+        # which speeds count as motion, as narrow as the filter allows; the sign itself is remembered
         sign = float(np.clip(problem.shape.presliding[i] * data.cutoff, 1e-3, 1e-2))
         resolution = _resolution(np.concatenate([log.position[:, i] for log in logs]))
         joints.append(
@@ -592,6 +592,7 @@ def identified(
                     stribeck_velocity=velocity,
                     load=max(0.0, value("load")),
                     sign_velocity=sign,
+                    presliding=problem.shape.presliding[i],
                 ),
                 sensing=replace(
                     joint.sensing,

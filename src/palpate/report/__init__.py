@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ._style import encode_png
+from .feel import FeelReport, write_feel_report
 from .figures import (
     coverage_figure,
     error_figure,
@@ -18,6 +19,7 @@ from .weigh import write_weigh_report
 from .weighing import WeighReport
 
 __all__ = [
+    "FeelReport",
     "StudyFiles",
     "StudyRow",
     "WeighReport",
@@ -32,6 +34,7 @@ __all__ = [
     "table_figure",
     "torque_figure",
     "update_markdown",
+    "write_feel_report",
     "write_study",
     "write_weigh_report",
 ]

@@ -42,7 +42,7 @@ def write_weigh_report(report: WeighReport, path: str | PathLike[str]) -> Path:
         MissingExtraError: matplotlib is not installed.
     """
     with drawing():
-        sections = [_header(report), _card(report)]
+        sections = [header(report.title, report.arm, report.time_s), _card(report)]
         if len(report.time_s):
             sections += [_mass(report), _comparison(report), *_joints(report), _error(report)]
         if report.settings:
@@ -51,23 +51,28 @@ def write_weigh_report(report: WeighReport, path: str | PathLike[str]) -> Path:
             sections.append(_page.section("What was repaired in the log", _page.lines(report.repair)))
         if report.provenance:
             sections.append(_page.section("Where arm and data come from", _page.lines(report.provenance)))
-        sections.append(
-            "<footer>Signs: M(q) q̈ + C(q, q̇) q̇ + g(q) + τ_f(q̇) = τ + τ_ext; τ_ext is positive when the environment "
-            "pushes the robot. SI units. Bands and “±” of the mass are 95 % (1.96 standard deviations).</footer>"
-        )
+        sections.append(footer("Bands and “±” of the mass are 95 % (1.96 standard deviations)."))
     return _files.write(path, _page.page(report.title, (s for s in sections if s)))
 
 
-def _header(report: WeighReport) -> str:
-    time = report.time_s
-    parts = [report.arm] if report.arm else []
+def footer(more: str) -> str:
+    """The conventions, and how uncertainty is shown."""
+    return (
+        "<footer>Signs: M(q) q̈ + C(q, q̇) q̇ + g(q) + τ_f(q̇) = τ + τ_ext; τ_ext is positive when the environment "
+        f"pushes the robot. SI units. {more}</footer>"
+    )
+
+
+def header(title: str, arm: str, time: Array) -> str:
+    """Title, arm, and how much was recorded; `time` (N,) [s]."""
+    parts = [arm] if arm else []
     if len(time) > 1:
         spacing = float(np.median(np.diff(time)))
         rate = f" at {number(1.0 / spacing, 3)} Hz" if spacing > 0.0 else ""
         parts.append(f"{number(float(np.ptp(time)), 3)} s, {len(time)} samples{rate}")
     elif not len(time):
         parts.append("no samples")
-    return f'<header><h1>{escape(report.title)}</h1><p class="sub">{escape(" · ".join(parts))}</p></header>'
+    return f'<header><h1>{escape(title)}</h1><p class="sub">{escape(" · ".join(parts))}</p></header>'
 
 
 def _card(report: WeighReport) -> str:
@@ -100,7 +105,8 @@ def _at_end(report: WeighReport) -> bool:
     return not len(time) or report.headline.time_s >= float(time[-1])
 
 
-def _fact(name: str, value: str, more: str = "") -> str:
+def fact(name: str, value: str, more: str = "") -> str:
+    """A name and its value in a list of facts."""
     small = f"<small>{escape(more)}</small>" if more else ""
     return f"<div><dt>{escape(name)}</dt><dd>{escape(value)}{small}</dd></div>"
 
@@ -109,20 +115,20 @@ def _facts(report: WeighReport, mass: float, std: float, factor: float, unit: st
     facts = []
     truth = report.headline.truth
     if math.isfinite(truth):
-        facts.append(_fact("truth", f"{number(truth * factor)} {unit}"))
+        facts.append(fact("truth", f"{number(truth * factor)} {unit}"))
         error = mass - truth
         if math.isfinite(error):
             more = [f"{_signed(100.0 * error / truth, 2)} %"] if truth else []
             if std > 0.0:
                 more.append(f"{number(abs(error) / std, 2)} σ")
-            facts.append(_fact("error", f"{_signed(error * factor, 2)} {unit}", ", ".join(more)))
+            facts.append(fact("error", f"{_signed(error * factor, 2)} {unit}", ", ".join(more)))
     settling = report.time_to_2_percent_s
     if settling is not None:
         never = not math.isfinite(settling)
-        facts.append(_fact("time to 2 %", "not reached" if never else f"{number(settling, 3)} s"))
+        facts.append(fact("time to 2 %", "not reached" if never else f"{number(settling, 3)} s"))
     changes = len(np.asarray(report.changes))
     if changes:
-        facts.append(_fact("changes of load found", str(changes)))
+        facts.append(fact("changes of load found", str(changes)))
     return facts
 
 
@@ -205,11 +211,11 @@ def _unit(report: WeighReport, joint: int, revolute: str, prismatic: str) -> str
     return prismatic if report.joint_kinds and report.joint_kinds[joint] == "prismatic" else revolute
 
 
-def _panels(report: WeighReport, build: Callable[[int], Figure], what: str, prefix: str) -> str:
-    """One small figure per joint, so that the page can put as many beside each other as fit."""
+def panels(names: Sequence[str], build: Callable[[int], Figure], what: str, prefix: str) -> str:
+    """One small figure per name, so that the page can put as many beside each other as fit."""
     parts = [
-        f"<figure>{svg(build(j), f'{what} of joint {clean(name, 60)}', f'{prefix}{j}')}</figure>"
-        for j, name in enumerate(report.joint_names)
+        f"<figure>{svg(build(j), f'{what} of {clean(name, 60)}', f'{prefix}{j}')}</figure>"
+        for j, name in enumerate(names)
     ]
     return f'<div class="panels">{"".join(parts)}</div>'
 
@@ -273,7 +279,9 @@ def _joints(report: WeighReport) -> list[str]:
 
         key = _page.key([_KEYS[name] for name in curves])
         sections.append(
-            _page.section(heading, key, _panels(report, build, heading.lower(), prefix), _page.read(text))
+            _page.section(
+                heading, key, panels(report.joint_names, build, heading.lower(), prefix), _page.read(text)
+            )
         )
     if torque is not None and n:
         sections.append(_torques(report, torque, points))
@@ -319,8 +327,8 @@ def _torques(report: WeighReport, torque: Array, points: int) -> str:
         "pushes the robot in the joint's positive direction, so a held object shows with the sign of its weight. "
         "A joint whose shade includes zero feels nothing it could be sure of; arrows name values beyond the scale."
     )
-    panels = _panels(report, build, "external torque", "e")
-    return _page.section("External torques", _page.key(key), panels, _page.read(text))
+    figures = panels(report.joint_names, build, "external torque", "e")
+    return _page.section("External torques", _page.key(key), figures, _page.read(text))
 
 
 def _efforts(report: WeighReport, effort: Array, points: int) -> str:
@@ -343,7 +351,7 @@ def _efforts(report: WeighReport, effort: Array, points: int) -> str:
     return _page.section(
         "Motor effort",
         _page.key([_KEYS["measured"]]),
-        _panels(report, build, "motor effort", "m"),
+        panels(report.joint_names, build, "motor effort", "m"),
         _page.read(text),
     )
 

@@ -95,6 +95,7 @@ _ALL = (
     Study("unknown-grasp", "The object is not held where it was thought", "bench"),
     Study("wrong-masses", "The arm's links do not weigh what the model says", "bench"),
     Study("grasp-and-release", "An object is taken and dropped at unknown times", "bench"),
+    Study("contacts", "Contacts found and not found: a real UR10e, and 100 h of two simulated arms", "bench"),
     Study("feedback", "What is weighed is fed back to the controller", "bench"),
     Study("box-inertias", "The same arm with inertias a body can have", "bench"),
     Study("replay", "Live, offline, replayed, chunked: the same bits; import time and size", "bench"),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from .proposal import TwoWayMotion, two_way_motion
 from .replay import Difference, Replay, replay
 from .scenes import Scene, find_pose, load_arm, scene, telling_pose, weight_torque
 from .session import Moment, Session, Task, arm_of, arrival, brick, check_mass, run
-from .weighing import Hold, Weighing, fit_joints, make_pipeline, weigh_log, weigh_session
+from .weighing import Hold, Weighing, fit_joints, fit_log, make_pipeline, refused, weigh_log, weigh_session
 
 __all__ = [
     "Difference",
@@ -15,6 +16,7 @@ __all__ = [
     "Scene",
     "Session",
     "Task",
+    "TwoWayMotion",
     "Weighing",
     "arm_of",
     "arrival",
@@ -22,12 +24,15 @@ __all__ = [
     "check_mass",
     "find_pose",
     "fit_joints",
+    "fit_log",
     "load_arm",
     "make_pipeline",
+    "refused",
     "replay",
     "run",
     "scene",
     "telling_pose",
+    "two_way_motion",
     "weigh_log",
     "weigh_session",
     "weight_torque",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +17,7 @@ _LEAST_TORQUE = 0.005
 
 
 def describe_noise(arm: Arm, log: Log) -> tuple[Arm, str]:
-    """The arm with the noise of a log in every joint whose sensing is not described.
+    """The arm with the noise of a log in every joint whose sensing is not described; a torque that is, is kept.
 
     Resolution is the step that positions lie on; the rest is what third differences hold beside a smooth motion:
     of white noise of deviation s they have the deviation sqrt(20) s.
@@ -24,7 +25,12 @@ def describe_noise(arm: Arm, log: Log) -> tuple[Arm, str]:
     Returns:
         the arm, and what was done; "" if everything was described.
     """
-    unknown = [i for i, j in enumerate(arm.joints) if j.sensing == Sensing()]
+    unknown = [
+        i
+        for i, j in enumerate(arm.joints)
+        if j.sensing.position_std == 0.0
+        and (j.sensing == Sensing() or (j.sensing.velocity_std is None and log.velocity is not None))
+    ]
     if not unknown or len(log) < 100:
         return arm, ""
     gain = arm.effort.gain(arm.n)
@@ -38,7 +44,12 @@ def describe_noise(arm: Arm, log: Log) -> tuple[Arm, str]:
         size = float(np.percentile(np.abs(good), 95.0)) if good.size else 0.0
         torque_std = max(_noise(torque), _LEAST_TORQUE * size, 1e-6)
         velocity = None if log.velocity is None else max(_noise(log.velocity[:, i]), 1e-4)
-        joints[i] = joints[i].replace(sensing=Sensing(step, position_std, velocity, 0.0, torque_std))
+        told = joints[i].sensing
+        if told.torque_std or told.torque_resolution:
+            found = replace(told, position_resolution=step, position_std=position_std, velocity_std=velocity)
+        else:
+            found = Sensing(step, position_std, velocity, 0.0, torque_std)
+        joints[i] = joints[i].replace(sensing=found)
     names = ", ".join(arm.joint_names[i] for i in unknown) if len(unknown) < arm.n else "the arm"
     return arm.replace(joints=tuple(joints)), (
         f"The description of {names} does not say how noisy its readings are: taken from the log itself "

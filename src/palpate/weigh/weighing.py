@@ -17,6 +17,7 @@ from ..logs import Log
 from ..phase import PhaseCurrents
 from ..pipeline import ESTIMATORS, OBSERVERS, Pipeline, Touch
 from .noise import describe_noise
+from .proposal import TwoWayMotion, stiction_std, two_way_motion
 from .scenes import Scene, telling_pose, weight_torque
 from .session import Session, Task, arm_of, arrival
 
@@ -28,6 +29,8 @@ TWO_SIDED_95 = 1.959963984540054
 """half width of the 95 % interval of a normal distribution [standard deviations]"""
 _HOPELESS = 2.0
 """an arm whose pose takes so many times its torque limit does not lift but is dragged along"""
+_SLOW = 200.0
+"""below it the payload filter's steps from sample to sample are too long for friction and drives [Hz]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +73,8 @@ class Weighing:
     goal_error: float = math.nan
     """largest distance of a joint from the last pose at the end [rad]; NaN: there is none"""
     interrupted: bool = False
+    proposal: TwoWayMotion | None = None
+    """a motion that would show what stiction hides; None: it hides little"""
 
     @property
     def time(self) -> Array:
@@ -196,6 +201,7 @@ class Weighing:
                 for h in self.holds
             ],
             "remarks": list(self.remarks),
+            "proposal": None if self.proposal is None else self.proposal.summary(),
             "interrupted": self.interrupted,
             "version": __version__,
         }
@@ -292,6 +298,7 @@ def make_pipeline(
     observer: str | None = None,
     *,
     model_torque: bool = False,
+    first_moment: bool = False,
 ) -> tuple[Pipeline, tuple[str, ...]]:
     """The pipeline that weighs, from names.
 
@@ -301,6 +308,7 @@ def make_pipeline(
             masses.
         observer: one of palpate.pipeline.OBSERVERS, or "none"; None: what suits the estimator.
         model_torque: the samples carry the controller's own model torque.
+        first_moment: the regression also finds where the load is held; it needs motion of several joints.
 
     Returns:
         the pipeline, and what was decided that a person should know.
@@ -343,7 +351,8 @@ def make_pipeline(
         raise InputError(
             f"estimator {estimator!r} weighs an external torque: choose an observer, one of {', '.join(OBSERVERS)}"
         )
-    return Pipeline(arm, observer=chosen, payload=ESTIMATORS[estimator]()), tuple(remarks)
+    options = {"first_moment": first_moment} if estimator == "regression" else {}
+    return Pipeline(arm, observer=chosen, payload=ESTIMATORS[estimator](**options)), tuple(remarks)
 
 
 def _observer_options(arm: Arm, name: str) -> dict[str, Any]:
@@ -499,8 +508,58 @@ def weigh_log(
     if arm is None:
         arm = arm_of(log)
         remarks.append("The arm is the one the log was recorded with.")
-    log, note = fit_joints(log, arm)
+    arm, log, note = fit_log(log, arm)
     remarks += note
+    slow = arm.has_dynamics and 0.0 < log.rate < _SLOW
+    if slow:
+        if estimator == "payload-filter":
+            raise InputError(
+                f"the payload filter needs at least {_SLOW:g} samples per second, the log has {log.rate:.3g}: "
+                "take --estimator regression"
+            )
+        estimator = estimator or "regression"
+        if estimator == "regression" and observer is None:
+            observer = "momentum"
+            remarks.append(
+                f"At {log.rate:.3g} Hz, below {_SLOW:g} Hz, the load is weighed by regression on a momentum observer."
+            )
+    pipeline, decided = make_pipeline(
+        arm, estimator, observer, model_torque=log.model_torque is not None, first_moment=slow
+    )
+    remarks += decided
+    touch = pipeline.run(log)
+    result = Weighing(
+        arm=arm,
+        pipeline=pipeline.options(),
+        log=log,
+        touch=touch,
+        status=Status(int(touch.payload.status[-1])) if len(log) else Status.warming,
+        truth=_truth(log),
+        desired=_setpoints(log),
+    )
+    remarks += refused(touch)
+    motion = _two_way(result)
+    said = () if motion is None else (motion.words(),)
+    return replace(result, remarks=(*_why(result, None), *said, *remarks), proposal=motion)
+
+
+def refused(touch: Touch) -> list[str]:
+    """How many samples of a run were not used, and why; empty if all were."""
+    bad = int(np.count_nonzero(np.isin(touch.status, [int(Status.non_finite), int(Status.time_error)])))
+    if not bad:
+        return []
+    return [
+        f"{bad} of {len(touch.status)} samples were not used: NaN, absurd numbers or times that do not rise."
+    ]
+
+
+def fit_log(log: Log, arm: Arm) -> tuple[Arm, Log, list[str]]:
+    """Arm and log made for each other: the arm's joints in its order, noise described; and what was assumed for that.
+
+    Raises:
+        InputError: they do not fit: joints, or torque where the arm says current.
+    """
+    log, remarks = fit_joints(log, arm)
     if arm.effort.kind == "phase_currents":
         log, arm = PhaseCurrents.of(arm).convert(log), arm.replace(effort=Effort.torque())
         remarks.append("Motor torque from two phase currents per joint.")
@@ -517,24 +576,19 @@ def weigh_log(
     if arm.effort.kind != "undeclared":
         arm, said = describe_noise(arm, log)
         remarks += [said] if said else []
-    pipeline, decided = make_pipeline(arm, estimator, observer, model_torque=log.model_torque is not None)
-    remarks += decided
-    touch = pipeline.run(log)
-    result = Weighing(
-        arm=arm,
-        pipeline=pipeline.options(),
-        log=log,
-        touch=touch,
-        status=Status(int(touch.payload.status[-1])) if len(log) else Status.warming,
-        truth=_truth(log),
-        desired=_setpoints(log),
-    )
-    bad = int(np.count_nonzero(np.isin(touch.status, [int(Status.non_finite), int(Status.time_error)])))
-    if bad:
-        remarks.append(
-            f"{bad} of {len(log)} samples were not used: NaN, absurd numbers or times that do not rise."
-        )
-    return replace(result, remarks=(*_why(result, None), *remarks))
+    return arm, log, remarks
+
+
+def _two_way(result: Weighing) -> TwoWayMotion | None:
+    """The motion to propose where the mass is hardly better known than stiction at rest allows."""
+    finite = np.isfinite(result.log.position).all(axis=1) & (np.abs(result.log.position) < 1e3).all(axis=1)
+    if not finite.any():
+        return None
+    q = result.log.position[finite][-1]
+    stiction = stiction_std(result.arm, q)
+    if not 0.5 * stiction < result.mass_std < 5.0 * stiction:  # far more than stiction has another reason
+        return None
+    return two_way_motion(result.arm, q)
 
 
 def _setpoints(log: Log) -> tuple[Array, Array] | None:

@@ -50,7 +50,7 @@ class DisturbanceKalman {
       beta[u] = t.Ct_dq[u] - t.g[u] - friction.torque(s.dq[u]);
       slope[u] = friction.derivative(s.dq[u]);
       turned[u] = travel_[u].step(friction, s.dq[u], s.dq_std[u]);
-      const double error = friction.uncertainty(s.dq[u], config_.friction_fraction);
+      const double error = friction.uncertainty(s.dq[u], config_.friction_fraction, s.tau[u]);
       friction_variance_[u] = error * error;
     }
     momentum_noise(s);

@@ -39,6 +39,7 @@ class ExtendedKalman {
 
   ExternalTorque step(const JointSample& s) noexcept {
     if (s.status == Status::non_finite || s.status == Status::time_error) return report(Status::held);
+    tau_ = s.tau;
     if (!started_ || s.status == Status::gap || !(s.dt > 0.0)) {
       start(s, true);
       return report(s.status == Status::gap ? Status::gap : Status::warming);
@@ -100,7 +101,7 @@ class ExtendedKalman {
       for (int i = 0; i < arm_->n(); ++i) {
         const auto u = detail::at(i);
         out.torque[u] = filter_.parameter(i);
-        const double friction = arm_->joint(i).friction.uncertainty(filter_.dq(i), config_.friction_fraction);
+        const double friction = arm_->joint(i).friction.uncertainty(filter_.dq(i), config_.friction_fraction, tau_[u]);
         out.noise[u] = std::sqrt(filter_.parameter_variance(i));
         out.std[u] = std::hypot(out.noise[u], friction);
       }
@@ -110,7 +111,7 @@ class ExtendedKalman {
   const Arm* arm_;
   ExtendedKalmanConfig config_;
   JointKalman<max_joints> filter_;
-  JointVector torque_variance_{};
+  JointVector torque_variance_{}, tau_{};
   JointKalman<max_joints>::Parameters decay_{};
   bool started_ = false;
 };

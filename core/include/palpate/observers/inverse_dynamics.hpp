@@ -18,7 +18,7 @@ class ResidualFilter {
     elapsed_ += s.dt;
     const double share = std::min(1.0, 0.5 * 1.11 * cutoff_ * s.dt);  // noise bandwidth, 1.11 w_c for order 2, against the sampling
     for (int j = 0; j < arm_->n(); ++j) {
-      friction_[at(j)] = arm_->joint(j).friction.uncertainty(s.dq[at(j)], friction_fraction);
+      friction_[at(j)] = arm_->joint(j).friction.uncertainty(s.dq[at(j)], friction_fraction, s.tau[at(j)]);
       variance_[at(j)] = share * noise[at(j)];
     }
   }

@@ -39,7 +39,7 @@ class MomentumObserver {
         const auto u = detail::at(j);
         r_[u] = a * r_[u] + b * ((t.p[u] - p_[u]) / s.dt - s.tau[u] - 0.5 * (beta[u] + beta_[u]));
         // White torque noise through the lag, white momentum noise through its derivative and the lag, and the friction.
-        const double friction = arm_->joint(j).friction.uncertainty(s.dq[u], config_.friction_fraction);
+        const double friction = arm_->joint(j).friction.uncertainty(s.dq[u], config_.friction_fraction, s.tau[u]);
         variance_[u] = b / (1.0 + a) * arm_->torque_variance(j) + 2.0 / (1.0 + a) * (b / s.dt) * (b / s.dt) * p_variance[u];
         friction_[u] = friction;
       }

@@ -59,7 +59,7 @@ class MomentumSuperTwisting {
         one_sided_[u] = std::abs(sign) < 1.0 ? 0.0 : (sign * side_[u] >= 1.0 ? one_sided_[u] : 0.0) + h;
         side_[u] = sign;
         outrun = outrun || one_sided_[u] >= settling_time;
-        const double friction = arm_->joint(j).friction.uncertainty(s.dq[u], config_.friction_fraction);
+        const double friction = arm_->joint(j).friction.uncertainty(s.dq[u], config_.friction_fraction, s.tau[u]);
         variance_[u] = 2.0 * config_.max_rate * std::sqrt(p_variance[u]);
         friction_[u] = friction;
       }

@@ -94,7 +94,7 @@ class SlidingModeObserver {
         tau += M_(i, j) * low_pass_.value()[detail::at(j)];
         variance += M_(i, j) * M_(i, j) * spread * spread;
       }
-      const double friction = arm_->joint(i).friction.uncertainty(x2_[detail::at(i)], config_.friction_fraction);
+      const double friction = arm_->joint(i).friction.uncertainty(x2_[detail::at(i)], config_.friction_fraction, s.tau[detail::at(i)]);
       torque_[detail::at(i)] = tau;
       variance_[detail::at(i)] = variance + arm_->torque_variance(i);
       friction_[detail::at(i)] = friction;
