@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ._render import Camera
+from .clearance import Clearance
 from .plant import Integrator, Load, Plant, Truth
 from .scenarios import Attach, Push, Release, ScenarioEvent, Schedule, StopPushing, pick_and_place
 from .sensing import Fault, FaultKind, SensorModel
@@ -10,6 +11,7 @@ from .sensing import Fault, FaultKind, SensorModel
 __all__ = [
     "Attach",
     "Camera",
+    "Clearance",
     "Fault",
     "FaultKind",
     "Integrator",
