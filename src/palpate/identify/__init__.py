@@ -3,7 +3,9 @@
 Functions from data to frozen results; nothing is printed, plotted or written. Needs the extra ``identify``.
 """
 
+from palpate.identify.cad import Body, mesh_body, printed_complaint, with_meshes
 from palpate.identify.data import RegressionData, prepare
+from palpate.identify.excitation import Excitation, excite, to_csv, to_ros
 from palpate.identify.fitting import Estimate, Fit, Prediction, Residuals, fit
 from palpate.identify.friction import Coupling, FrictionModel, FrictionShape
 from palpate.identify.gains import GainFit, KnownLoad, fit_gains
@@ -12,9 +14,11 @@ from palpate.identify.servo import BusDrive, fit_bus_drive
 from palpate.identify.transmission import TransmissionFit, fit_transmission
 
 __all__ = [
+    "Body",
     "BusDrive",
     "Coupling",
     "Estimate",
+    "Excitation",
     "Fit",
     "FrictionModel",
     "FrictionShape",
@@ -26,9 +30,15 @@ __all__ = [
     "Residuals",
     "TransmissionFit",
     "estimate_load",
+    "excite",
     "fit",
     "fit_bus_drive",
     "fit_gains",
     "fit_transmission",
+    "mesh_body",
     "prepare",
+    "printed_complaint",
+    "to_csv",
+    "to_ros",
+    "with_meshes",
 ]

@@ -19,7 +19,7 @@ from palpate.arm import Arm, Array
 from palpate.errors import InputError
 from palpate.identify.consistent import consistent, prior_links
 from palpate.identify.data import RegressionData
-from palpate.identify.regress import LINK_TERMS, RANK, Problem
+from palpate.identify.regress import LINK_TERMS, RANK, IndexArray, Problem
 
 ROWS = 400
 """rows looked at"""
@@ -178,16 +178,16 @@ def _mistakes(arm: Arm) -> Iterator[_Mistake]:
 
 def _better_order(
     arm: Arm, rows: _Rows, prior: Array, left: Array, *, effort_only: bool
-) -> tuple[Array, Array]:
+) -> tuple[IndexArray, Array]:
     """The best order found by exchanging two columns at a time (n,), and what it leaves unexplained (n,)."""
 
-    def ordered(order: Array) -> _Rows:
+    def ordered(order: IndexArray) -> _Rows:
         if effort_only:
             return _Rows(rows.q, rows.dq, rows.ddq, rows.torque[:, order])
         return _Rows(rows.q[:, order], rows.dq[:, order], rows.ddq[:, order], rows.torque[:, order])
 
-    start = [np.arange(arm.n), np.argsort(np.argsort(arm.joint_names))]
-    tried = {tuple(s.tolist()): _unexplained(arm, ordered(s), prior) for s in start[1:]}
+    alphabet = np.argsort(np.argsort(arm.joint_names))
+    tried = {tuple(alphabet.tolist()): _unexplained(arm, ordered(alphabet), prior)}
     tried[tuple(range(arm.n))] = left
     best = min(tried, key=lambda o: float(np.sum(np.log(tried[o]))))
     for _ in range(arm.n):
@@ -206,7 +206,7 @@ def _better_order(
     return np.array(best), tried[best]
 
 
-def _order_text(arm: Arm, order: Array, *, effort_only: bool) -> str:
+def _order_text(arm: Arm, order: IndexArray, *, effort_only: bool) -> str:
     """The log's columns, named by the arm's joints they hold."""
     holds = [arm.joint_names[int(k)] for k in np.argsort(order)]
     what = "the columns of the effort, but not those of the position," if effort_only else "the log's columns"

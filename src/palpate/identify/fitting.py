@@ -435,7 +435,7 @@ def _final(
     if method == "damped":
         weights = solution.weights / solution.inflation
         phi = damped(problem, _start(arm, problem), math.sqrt(prior), weights=weights)
-        covariance = np.linalg.inv(H + prior * np.eye(len(phi)))
+        covariance = np.asarray(np.linalg.inv(H + prior * np.eye(len(phi))), dtype=np.float64)
     share = np.einsum("ij,ji->i", covariance, H)
     return phi, covariance, share.clip(0.0, 1.0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from ._render import Camera
 from .clearance import Clearance
 from .plant import Integrator, Load, Plant, Truth
+from .rehearsal import Rehearsal, rehearse
 from .scenarios import Attach, Push, Release, ScenarioEvent, Schedule, StopPushing, pick_and_place
 from .sensing import Fault, FaultKind, SensorModel
 
@@ -18,6 +19,7 @@ __all__ = [
     "Load",
     "Plant",
     "Push",
+    "Rehearsal",
     "Release",
     "ScenarioEvent",
     "Schedule",
@@ -25,4 +27,5 @@ __all__ = [
     "StopPushing",
     "Truth",
     "pick_and_place",
+    "rehearse",
 ]

@@ -178,7 +178,8 @@ class _Information:
         return A.T @ A / len(motion[0])
 
     def figures(self, motion: tuple[Array, Array, Array]) -> tuple[float, float]:
-        """Logarithm of the determinant per base parameter, and the conditioning; -inf and inf: not all are shown."""
+        """Logarithm of the determinant per base parameter, and the conditioning; -inf and inf: not all "
+        "are shown."""
         values = np.linalg.eigvalsh(self._gram(motion))
         if values[0] <= 1e-14 * values[-1]:
             return -np.inf, np.inf
@@ -284,7 +285,8 @@ def excite(
             else f"needs {np.nanmax(torque / effort):.0%} of a joint's effort limit"
         )
         raise InputError(
-            f"the smallest of {len(SHRINK)} motions tried {what}: allow less (margin, velocity, acceleration), or "
+            f"the smallest of {len(SHRINK)} motions tried {what}: allow less (margin, velocity, "
+            "acceleration), or "
             "try another seed"
         )
     t = np.arange(round(seconds * rate) + 1) / rate
@@ -372,3 +374,46 @@ def _series(
         push = speed / RISE
     middle, half = 0.5 * (low + high), 0.5 * margin * (high - low)
     return _Series(middle - half, middle + half, margin * speed, margin * push, seconds, harmonics)
+
+
+def to_csv(motion: Excitation) -> str:
+    """A table with palpate's own column names: time_s, position_1, ..., velocity_1, ..., acceleration_1, ..."""
+    n = motion.q.shape[1]
+    names = [f"{what}_{j + 1}" for what in ("position", "velocity", "acceleration") for j in range(n)]
+    rows = np.column_stack([motion.time, motion.q, motion.dq, motion.ddq])
+    lines = [",".join(["time_s", *names]), *(",".join(f"{v:.9g}" for v in row) for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def to_ros(motion: Excitation, *, approach: float = 5.0) -> str:
+    """The motion as YAML of a trajectory_msgs/msg/JointTrajectory, as ``ros2 topic pub`` takes it.
+
+    Ten points per period of the highest harmonic, with velocities and accelerations, between which a
+    joint_trajectory_controller runs quintic splines.
+
+    Args:
+        motion: the motion.
+        approach: time given to reach the first point from wherever the arm is [s], > 0; this way is not checked.
+
+    Raises:
+        InputError: the approach is not positive.
+    """
+    if not (np.isfinite(approach) and approach > 0.0):
+        raise InputError(f"the approach must take a positive time [s], got {approach!r}")
+    wanted = np.linspace(0.0, motion.period, COARSE * motion.harmonics + 1)
+    rows = np.unique(np.searchsorted(motion.time, wanted - 1e-9).clip(0, len(motion.time) - 1))
+
+    def listed(values: Array) -> str:
+        return "[" + ", ".join(f"{v:.7f}" for v in values) + "]"
+
+    names = ", ".join(f'"{name}"' for name in motion.joint_names)
+    lines = ['header: {frame_id: ""}', f"joint_names: [{names}]", "points:"]
+    for k in rows:
+        nanoseconds = round((approach + float(motion.time[k])) * 1e9)
+        lines += [
+            f"- positions: {listed(motion.q[k])}",
+            f"  velocities: {listed(motion.dq[k])}",
+            f"  accelerations: {listed(motion.ddq[k])}",
+            f"  time_from_start: {{sec: {nanoseconds // 10**9}, nanosec: {nanoseconds % 10**9}}}",
+        ]
+    return "\n".join(lines) + "\n"
