@@ -250,13 +250,13 @@ def _open(text: str, columns: str | None, arm: Arm, remarks: list[str]) -> Log:
     elif columns is None:
         log, name = open_known(text, arm.n)
         if name is not None:
-            remarks.append(f"{text}: recognised as a log of the data set {name}")
+            remarks.append(f"{Path(text).name}: recognised as a log of the data set {name}")
     else:
         log = Log.open(text, column_map(columns))
     dropped = sum(log.repair.dropped.values())
     if dropped:
         why = ", ".join(f"{reason} {count}" for reason, count in log.repair.dropped.items())
-        remarks.append(f"{text}: {dropped} rows dropped ({why})")
+        remarks.append(f"{Path(text).name}: {dropped} rows dropped ({why})")
     log, said = fit_joints(log, arm)
     remarks += [r for r in said if r not in remarks]
     # what they are called does not matter any more
@@ -402,15 +402,19 @@ def _tell(fit: Fit, gains: GainFit | None, remarks: Sequence[str]) -> None:
         overall += f"; held out {held.relative_overall:.1%}, {held.overall:.3g} N m ({held.what})"
     say(overall)
     good = trusted(fit)
-    doubtful = [name for name, ok in zip(fit.base.names, good, strict=True) if not ok]
+    zero = [
+        name
+        for name, value, std in zip(fit.base.names, fit.base.value, fit.base.std, strict=True)
+        if std >= 0.5 * abs(value)
+    ]
     say(
         f"base         {fit.base.rank} of {fit.base.structural_rank} parameters seen, {sum(good)} to better "
-        "than 10 %; "
-        f"conditioning {fit.base.conditioning:.3g}"
+        "than 10 %, "
+        f"{len(good) - sum(good) - len(zero)} roughly; conditioning {fit.base.conditioning:.3g}"
     )
-    if doubtful:
-        listed = ", ".join(doubtful[:8]) + (f" and {len(doubtful) - 8} more" if len(doubtful) > 8 else "")
-        say(f"do not trust {listed}")
+    if zero:
+        listed = ", ".join(zero[:8]) + (f" and {len(zero) - 8} more" if len(zero) > 8 else "")
+        say(f"             not told from 0: {listed}")
     if gains is not None:
         pairs = (rounded(float(k), 1.96 * float(s)) for k, s in zip(gains.gain, gains.std, strict=True))
         for joint, (value, half) in zip(fit.arm.joints, pairs, strict=True):

@@ -19,7 +19,7 @@ from palpate.arm import Arm, Array
 from palpate.errors import InputError
 from palpate.identify.consistent import consistent, prior_links
 from palpate.identify.data import RegressionData
-from palpate.identify.regress import LINK_TERMS, RANK, IndexArray, Problem
+from palpate.identify.regress import LINK_TERMS, RANK, Base, IndexArray, Problem
 
 ROWS = 400
 """rows looked at"""
@@ -257,7 +257,7 @@ class Unseen:
     joints: tuple[int, ...]
 
 
-def not_shown(arm: Arm, problem: Problem) -> Unseen:
+def not_shown(arm: Arm, problem: Problem, base: Base) -> Unseen:
     """What the data of a problem did not show, in words."""
     data = problem.data
     sentences, blind = [], []
@@ -277,11 +277,27 @@ def not_shown(arm: Arm, problem: Problem) -> Unseen:
                 f"{joint.name} never reverses, so {joint.name}.coulomb and {joint.name}.offset cannot be told "
                 "apart; record it in both directions"
             )
-    return Unseen((*sentences, *_missing_links(arm, problem)), tuple(blind))
+    lost = [
+        p.name
+        for k, p in enumerate(problem.parameters)
+        if p.kind in problem.model.terms and p.index not in blind and k not in base.index
+    ]
+    if lost and base.rank < base.structural_rank:
+        sentences.append(
+            f"{', '.join(lost)} cannot be told from the rest: the speeds of this motion vary too little for the "
+            "friction model; record slow and fast motion, or choose a simpler --friction"
+        )
+    sentences += _missing_links(arm, problem)
+    if not sentences and base.rank < base.structural_rank:
+        sentences.append(
+            f"{base.structural_rank - base.rank} of {base.structural_rank} base parameters are too faint in this "
+            "motion; faster and more varied motion would show them"
+        )
+    return Unseen(tuple(sentences), tuple(blind))
 
 
 def _missing_links(arm: Arm, problem: Problem) -> list[str]:
-    """Sentences on combinations of link parameters that torques of this motion do not depend on."""
+    """Sentences on combinations of rigid parameters that torques of this motion do not depend on."""
     n = arm.n
     rng = np.random.default_rng(0)
     count = 40 * n
@@ -303,22 +319,36 @@ def _missing_links(arm: Arm, problem: Problem) -> list[str]:
 
     _, _, pivots = qr(gone.T, mode="economic", pivoting=True)
     lead = sorted(int(k) for k in pivots[: gone.shape[1]])
-    names = [f"{arm.joints[k // 10].link}.{LINK_TERMS[k % 10]}" for k in lead]
+    names = [
+        f"{arm.joints[k // 10].link}.{LINK_TERMS[k % 10]}"
+        if k < 10 * n
+        else f"{arm.joints[k - 10 * n].name}.rotor_inertia"
+        for k in lead
+    ]
     listed = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
     motion = _motion(arm, data, gone * inverse[:, None])
     return [
-        f"{len(names)} combinations of link parameters, led by {listed}, have no effect in this motion; "
+        f"{len(names)} combinations of rigid parameters, led by {listed}, have no effect in this motion; "
         f"to see them {motion}"
     ]
 
 
+def _rigid(arm: Arm, q: Array, dq: Array, ddq: Array) -> Array:
+    """Regressor of links and rotors, (N n, 11 n)."""
+    n = arm.n
+    A = np.zeros((len(q), n, 11 * n))
+    A[:, :, : 10 * n] = arm.regressor(q, dq, ddq)
+    A[:, np.arange(n), 10 * n + np.arange(n)] = ddq
+    return A.reshape(-1, 11 * n)
+
+
 def _gram(arm: Arm, q: Array, dq: Array, ddq: Array) -> Array:
-    Y = arm.regressor(q, dq, ddq).reshape(-1, 10 * arm.n)
-    return Y.T @ Y / len(q)
+    A = _rigid(arm, q, dq, ddq)
+    return A.T @ A / len(q)
 
 
 def _motion(arm: Arm, data: RegressionData, gone: Array) -> str:
-    """The fewest joints whose swinging shows the directions (10 n, k)."""
+    """The fewest joints whose swinging shows the directions (11 n, k)."""
     t = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     middle = data.q.mean(axis=0)
 
@@ -327,9 +357,10 @@ def _motion(arm: Arm, data: RegressionData, gone: Array) -> str:
         for i, j in enumerate(joints):
             w = i + 1.0  # each at its own frequency, so that all pairs of poses occur
             q[:, j], dq[:, j], ddq[:, j] = np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t)
-        Y = arm.regressor(middle + SWING * q, SWING * dq, SWING * ddq) @ gone
-        values = np.linalg.svd(Y.reshape(-1, gone.shape[1]), compute_uv=False)
-        return int(np.count_nonzero(values > 1e-6 * max(float(np.abs(Y).max()), 1e-300)))
+        values = np.linalg.svd(
+            _rigid(arm, middle + SWING * q, SWING * dq, SWING * ddq) @ gone, compute_uv=False
+        )
+        return int(np.count_nonzero(values > 1e-6 * max(float(values[0]), 1e-300)))
 
     chosen: tuple[int, ...] = ()
     best = 0

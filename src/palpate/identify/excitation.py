@@ -33,6 +33,8 @@ NEAR = 0.03
 SHRINK = (1.0, 0.8, 0.6, 0.45, 0.3)
 """parts of the limits' margin tried in turn until a motion keeps clear and within the effort limits"""
 
+STARTS = 50
+"""random motions the search chooses its start from"""
 HOPELESS = 20.0
 """cost of a start from which no search gets within effort limits and clear: it is not begun"""
 
@@ -76,13 +78,22 @@ class Excitation:
 class _Series:
     """Series from free numbers x: at rest at the ends, each joint scaled to the first of its limits.
 
+    The range low..high is where a joint may be, its width how much of it the motion may take.
     x holds per joint 2 (H - 1) coefficients and the place of the series within the joint's range.
     """
 
     def __init__(
-        self, low: Array, high: Array, velocity: Array, acceleration: Array, period: float, harmonics: int
+        self,
+        low: Array,
+        high: Array,
+        width: Array,
+        velocity: Array,
+        acceleration: Array,
+        period: float,
+        harmonics: int,
     ) -> None:
-        self.low, self.high, self.velocity, self.acceleration = low, high, velocity, acceleration
+        self.low, self.high, self.width = low, high, width
+        self.velocity, self.acceleration = velocity, acceleration
         self.period, self.harmonics, self.n = period, harmonics, len(low)
         order = np.arange(1, harmonics + 1)
         # orthonormal bases of what keeps the ends at rest
@@ -114,7 +125,7 @@ class _Series:
         s, ds, dds = (wave @ coefficients for wave in self.fine)
         used = np.max(
             [
-                np.ptp(s, axis=0) / (self.high - self.low),
+                np.ptp(s, axis=0) / self.width,
                 np.abs(ds).max(axis=0) / self.velocity,
                 np.abs(dds).max(axis=0) / self.acceleration,
             ],
@@ -252,8 +263,8 @@ def excite(
 
     least, best = np.nan, np.zeros(0)
     for shrink in SHRINK:
-        series = _series(arm, seconds, int(harmonics), margin * shrink, velocity, acceleration)
-        starts = [_random(series, rng) for _ in range(20)]
+        series = _series(arm, seconds, int(harmonics), margin, shrink, velocity, acceleration)
+        starts = [_random(series, rng) for _ in range(STARTS)]
         costs = [cost(x, series) for x in starts]
         if min(costs) > HOPELESS and shrink != SHRINK[-1]:
             continue
@@ -296,7 +307,6 @@ def excite(
     dq[[0, -1]], ddq[[0, -1]] = 0.0, 0.0
     determinant, conditioning = information.figures(series.sample(best))
     others = [information.figures(series.sample(_random(series, rng)))[1] for _ in range(21)]
-    width = series.high - series.low
     return Excitation(
         joint_names=arm.joint_names,
         time=t,
@@ -312,7 +322,7 @@ def excite(
         * shrink
         * np.column_stack(
             [
-                np.ptp(fine[0], axis=0) / width,
+                np.ptp(fine[0], axis=0) / series.width,
                 np.abs(fine[1]).max(axis=0) / series.velocity,
                 np.abs(fine[2]).max(axis=0) / series.acceleration,
             ]
@@ -330,7 +340,7 @@ def _torque(arm: Arm, q: Array, dq: Array, ddq: Array) -> Array:
 
 def _random(series: _Series, rng: np.random.Generator) -> Array:
     rows = rng.standard_normal((series.n, series.size // series.n))
-    rows[:, -1] *= 0.5
+    rows[:, -1] *= 0.7
     found: Array = rows.ravel()
     return found
 
@@ -353,6 +363,7 @@ def _series(
     seconds: float,
     harmonics: int,
     margin: float,
+    shrink: float,
     velocity: float | Array | None,
     acceleration: float | Array | None,
 ) -> _Series:
@@ -373,7 +384,15 @@ def _series(
     if push is None:
         push = speed / RISE
     middle, half = 0.5 * (low + high), 0.5 * margin * (high - low)
-    return _Series(middle - half, middle + half, margin * speed, margin * push, seconds, harmonics)
+    return _Series(
+        middle - half,
+        middle + half,
+        2.0 * shrink * half,
+        margin * shrink * speed,
+        margin * shrink * push,
+        seconds,
+        harmonics,
+    )
 
 
 def to_csv(motion: Excitation) -> str:

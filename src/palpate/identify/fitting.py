@@ -274,10 +274,10 @@ def fit(
     if validate_on is not None:
         others = (validate_on,) if isinstance(validate_on, Log) else tuple(validate_on)
         unseen = _problem_of(arm, others, problem, phi, data.cutoff, effort, gain)
-        held, spread = _held_out(unseen, unseen.predict(phi), "validate_on")
+        held, spread = _held_out(unseen, unseen.predict(phi), "logs the fit has not seen")
     elif cross_validate:
         held, spread = _held_out(*_cross_validate(builder, problem, method, prior))
-    gaps = not_shown(arm, problem)
+    gaps = not_shown(arm, problem, base)
     return Fit(
         arm=_keep(arm, identified(arm, problem, links, data, gain, every), gaps.joints),
         parameters=_table(arm, problem, phi, covariance, share),

@@ -28,6 +28,7 @@ from palpate.logs.repair import (
 )
 
 _JSON_LIMIT = 256 << 20  # [bytes]; a recording of minutes takes one or two MB
+_LEAST_ROWS = 16  # fewer show no derivative
 _TX40_RATIO = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
 _TX40_RATIO[5, 4] = 32.0  # motor 6 turns with joint 5, too
 _TX40_RATIO.setflags(write=False)
@@ -56,14 +57,18 @@ def open_known(path: str | PathLike[str], joints: int) -> tuple[Log, str | None]
                 log = Log.open(path, ColumnMap.named(name))
             except LogError:
                 continue
-            if log.n == joints and _moves_as_it_says(log):
+            if log.n != joints:
+                continue
+            if len(log) < _LEAST_ROWS:
+                raise LogError(f"{path}: {len(log)} rows: too few to tell what its columns are") from None
+            if _moves_as_it_says(log):
                 return log, name
         raise
 
 
 def _moves_as_it_says(log: Log) -> bool:
     """Whether time runs and the velocity is the derivative of the position: columns of another layout are not."""
-    if log.velocity is None or len(log) < 16:
+    if log.velocity is None:
         return False
     time = log.seconds
     good = np.r_[np.diff(time) > 0.0, False]

@@ -58,7 +58,7 @@ def write_identify_report(
     with drawing():
         sections = [_header(fit, title), _card(fit)]
         if remarks or fit.unseen:
-            sections.append(_page.section("Mind this", _page.lines([*fit.unseen, *remarks])))
+            sections.append(_page.section("Remarks", _page.lines([*fit.unseen, *remarks])))
         sections.append(_residuals(fit))
         if gains is not None:
             sections.append(_gains(fit, gains))
@@ -74,7 +74,7 @@ def write_identify_report(
             "interval "
             "(1.96 standard deviations σ); σ counts the memory of the residual, so that neighbouring "
             "samples are not "
-            "taken for independent ones. SI units.</footer>"
+            "taken for independent ones. SI units. Written by palpate identify.</footer>"
         )
     return _files.write(path, _page.page(title, (s for s in sections if s)))
 
@@ -184,19 +184,22 @@ def _torques(fit: Fit, name: str, prediction: Prediction, index: int, count: int
     points = min(max(_POINTS // (3 * fit.arm.n * max(count, 1)), 150), 900)
     panels = []
     for j, joint in enumerate(fit.arm.joints):
-        error = prediction.measured[:, j] - prediction.predicted[:, j]
-        rms = float(np.sqrt(np.mean(np.square(error))))
+        # before a joint's first motion its friction is anyone's guess
+        known = prediction.known[:, j]
+        predicted = np.where(known, prediction.predicted[:, j], np.nan)
+        error = prediction.measured[:, j] - predicted
+        rms = float(np.sqrt(np.mean(np.square(error[known])))) if known.any() else math.nan
         figure = joints_figure(
             prediction.time,
             {
                 "measured": prediction.measured[:, j : j + 1],
-                "estimated": prediction.predicted[:, j : j + 1],
+                "estimated": predicted[:, None],
                 "residual": error[:, None],
             },
             [joint.name],
             quantity="torque",
             unit="N m" if joint.kind == "revolute" else "N",
-            notes=[f"residual {number(rms, 2)} rms"],
+            notes=[f"off by {number(rms, 2)} rms"],
             columns=1,
             key=False,
             points=points,
@@ -303,6 +306,10 @@ def source(estimate: Estimate) -> str:
     return "data and prior" if estimate.seen >= 0.5 else "prior"
 
 
+def _unit(unit: str) -> str:
+    return unit.replace("^2", "²")
+
+
 def _friction(fit: Fit) -> str:
     named = _by_name(fit)
     terms = [*fit.friction.terms, *(["rotor_inertia"] if fit.friction.rotor_inertia else [])]
@@ -323,7 +330,7 @@ def _friction(fit: Fit) -> str:
             e = named[f"{name}.{term}"]
             value, half = _pair(e.value, e.std)
             rows.append([escape(f"{name}: {term}"), f"{value} ± {half}", *[""] * len(terms)])
-    head = ["joint", *(f"{t.replace('_', ' ')} [{units[t]}]" for t in terms), "presliding [rad]"]
+    head = ["joint", *(f"{t.replace('_', ' ')} [{_unit(units[t])}]" for t in terms), "presliding [rad]"]
     note = _page.read(
         "“(prior)” marks what this motion tells less about than was supposed before. Friction drifts by a "
         "tenth and more "
@@ -374,9 +381,9 @@ def _base(fit: Fit) -> str:
         elif relative < 0.5:
             verdict = "roughly"
         else:
-            verdict = '<span class="no">not told from 0</span>'
+            verdict = "not told from 0"
         share = f"{number(100.0 * relative, 2)} %" if relative < 10.0 else "> 1000 %"
-        rows.append([escape(name), f"{text} ± {half}", escape(unit), share, verdict])
+        rows.append([escape(name), f"{text} ± {half}", escape(_unit(unit)), share, verdict])
     head = ("led by", "value", "unit", "σ / value", "")
     note = _page.read(
         "What the data alone say, by weighted least squares: each is its leading parameter plus the "

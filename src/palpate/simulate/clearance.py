@@ -11,6 +11,8 @@ from . import _model
 ALWAYS = 0.95
 """links that touch in so many of the random poses touch by the way they are drawn, not by the pose"""
 POSES = 200
+THIN = 0.5
+"""part of the drawn thickness taken for links of unknown shape"""
 
 
 class Clearance:
@@ -45,10 +47,15 @@ class Clearance:
         model.geom_contype[:] = own
         model.geom_conaffinity[:] = own
         model.geom_margin[:] = 0.5 * self._reach
+        # nobody said how thick these are
+        known = {s.link for s in arm.shapes if s.kind != "mesh"}
+        stand_in = own & ~np.isin(self._link, list(known))
+        model.geom_size[stand_in, 0] *= THIN
         if floor is not None:
             model.geom_contype[plane], model.geom_conaffinity[plane] = 2, 0
             model.geom_conaffinity[own & (self._link > 0)] |= 2
             model.geom_pos[plane, 2] = floor
+            model.geom_sameframe[plane] = 0  # else a plane compiled at the origin stays there
             model.geom_margin[plane] = 0.5 * self._reach
         for body in range(model.nbody):  # what MuJoCo asks before it looks at a body's shapes
             mine = model.geom_bodyid == body
