@@ -156,7 +156,7 @@ def _draw(motion: Excitation, arm: Arm, path: Path) -> None:
     ]
     units = ["rad" if j.kind == "revolute" else "m" for j in arm.joints]
     figure = joints_figure(
-        motion.time, {"desired": motion.q}, motion.joint_names, unit=units, notes=notes, key=False
+        motion.time, {"estimated": motion.q}, motion.joint_names, unit=units, notes=notes, key=False
     )
     save_png(figure, path)
 
@@ -220,7 +220,7 @@ def _tell(motion: Excitation, arm: Arm, tried: Rehearsal | None, clearance: Any)
     )
     say(f"simulated    limits hold, clearance {near}; off by at most {tried.tracking.max():.2g} rad")
     for a, b in clearance.ignored:
-        say(f"! {a} and {b} touch in nearly every pose as they are drawn: this pair was not looked at")
+        say(f"! {a} and {b} touch in most poses as they are drawn: this pair was not looked at")
     if any(s.kind == "mesh" for s in arm.shapes):
         say("! the links' meshes are not opened: the clearance is that of capsules along the links")
 

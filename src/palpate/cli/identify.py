@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -184,6 +185,8 @@ def run(
                 cutoff=cutoff,
             )
         model = found_gains.arm
+        # the gains are per unit of whatever the effort is
+        free, held = ([_without_unit(log) for log in part] for part in (free, held))
     with _progress("fitting", silent):
         fit = identification.fit(
             model,
@@ -260,8 +263,6 @@ def _open(text: str, columns: str | None, arm: Arm, remarks: list[str]) -> Log:
     log, said = fit_joints(log, arm)
     remarks += [r for r in said if r not in remarks]
     # what they are called does not matter any more
-    from dataclasses import replace
-
     return log if log.joint_names == arm.joint_names else replace(log, joint_names=arm.joint_names)
 
 
@@ -283,6 +284,10 @@ def _declare(arm: Arm, logs: Sequence[Log], remarks: list[str]) -> Arm:
         "known load: from "
         "free motion only the ratios of torques to gains are identifiable)"
     )
+
+
+def _without_unit(log: Log) -> Log:
+    return replace(log, meta={k: v for k, v in log.meta.items() if k != "effort_unit"})
 
 
 def _load(text: str) -> tuple[float, str]:

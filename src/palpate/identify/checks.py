@@ -19,7 +19,7 @@ from palpate.arm import Arm, Array
 from palpate.errors import InputError
 from palpate.identify.consistent import consistent, prior_links
 from palpate.identify.data import RegressionData
-from palpate.identify.regress import LINK_TERMS, RANK, Base, IndexArray, Problem
+from palpate.identify.regress import LINK_TERMS, RANK, ROUNDING, Base, IndexArray, Problem
 
 ROWS = 400
 """rows looked at"""
@@ -268,7 +268,7 @@ def not_shown(arm: Arm, problem: Problem, base: Base) -> Unseen:
         if span < STILL:
             blind.append(j)
             sentences.append(
-                f"{joint.name} moves by {span:.2g} {unit} only, so {own} are not seen; swing it by "
+                f"{joint.name} moves by {round(span, 4):g} {unit} only, so {own} are not seen; swing it by "
                 f"{SWING:g} {unit} and more, both ways"
             )
         elif not (np.any(data.dq[:, j] > SLOW) and np.any(data.dq[:, j] < -SLOW)):
@@ -304,10 +304,10 @@ def _missing_links(arm: Arm, problem: Problem) -> list[str]:
     random = (rng.uniform(-np.pi, np.pi, (count, n)), *rng.standard_normal((2, count, n)))
     everything = _gram(arm, *random)
     scale = np.sqrt(np.diag(everything))
-    felt = scale > 0.0
+    felt = scale > ROUNDING * scale.max()
     inverse = np.where(felt, 1.0 / np.where(felt, scale, 1.0), 0.0)
     values, vectors = np.linalg.eigh(everything * np.outer(inverse, inverse))
-    basis = vectors[:, values > RANK * values[-1]]
+    basis = vectors[:, values > RANK**2 * values[-1]]
     data = problem.data
     step = max(1, len(data) // 1000)
     seen = _gram(arm, data.q[::step], data.dq[::step], data.ddq[::step])
@@ -327,10 +327,12 @@ def _missing_links(arm: Arm, problem: Problem) -> list[str]:
     ]
     listed = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
     motion = _motion(arm, data, gone * inverse[:, None])
-    return [
-        f"{len(names)} combinations of rigid parameters, led by {listed}, have no effect in this motion; "
-        f"to see them {motion}"
-    ]
+    what = (
+        f"{listed} has"
+        if len(names) == 1
+        else f"{len(names)} combinations of rigid parameters, led by {listed}, have"
+    )
+    return [f"{what} no effect in this motion; to see {'it' if len(names) == 1 else 'them'} {motion}"]
 
 
 def _rigid(arm: Arm, q: Array, dq: Array, ddq: Array) -> Array:
@@ -360,7 +362,8 @@ def _motion(arm: Arm, data: RegressionData, gone: Array) -> str:
         values = np.linalg.svd(
             _rigid(arm, middle + SWING * q, SWING * dq, SWING * ddq) @ gone, compute_uv=False
         )
-        return int(np.count_nonzero(values > 1e-6 * max(float(values[0]), 1e-300)))
+        # columns are in units of what random motion gives: less than a thousandth of it is not shown
+        return int(np.count_nonzero(values > 1e-3 * np.sqrt(len(t))))
 
     chosen: tuple[int, ...] = ()
     best = 0
@@ -373,7 +376,6 @@ def _motion(arm: Arm, data: RegressionData, gone: Array) -> str:
         chosen = (*chosen, rest[int(np.argmax(found))])
     names = [arm.joints[j].name for j in sorted(chosen)]
     if len(names) == 1:
-        together = f"{', '.join(names[:-1])} and {names[-1]}"
-    return f"swing {together} at the same time, at different frequencies, by {SWING:g} and more"
+        return f"swing {names[0]} by {SWING:g} and more, quickly enough to feel its inertia"
     together = f"{', '.join(names[:-1])} and {names[-1]}"
     return f"swing {together} at the same time, at different frequencies, by {SWING:g} and more"

@@ -18,7 +18,7 @@ import numpy as np
 from palpate.arm import Arm, Array
 from palpate.errors import ArmError, InputError, MissingExtraError
 from palpate.identify.friction import FrictionModel
-from palpate.identify.regress import RANK, parameters
+from palpate.identify.regress import RANK, ROUNDING, parameters
 
 VELOCITY = 1.0
 """taken where the arm states no velocity limit [rad/s or m/s]"""
@@ -28,6 +28,8 @@ TURN = np.pi
 """range taken of a joint without position limits: so far to both sides [rad]"""
 FINE, COARSE = 40, 10
 """samples per period of the highest harmonic: for limits, and for the information"""
+PEAK = float(1.0 / np.cos(np.pi / FINE))
+"""a trigonometric polynomial is nowhere larger than so many times its largest sample (Ehlich and Zeller 1964)"""
 NEAR = 0.03
 """clearance that is kept [m]"""
 SHRINK = (1.0, 0.8, 0.6, 0.45, 0.3)
@@ -131,10 +133,11 @@ class _Series:
             ],
             axis=0,
         )
-        used = np.maximum(used, 1e-12)
-        slack = (self.high - self.low) - np.ptp(s, axis=0) / used
+        used = np.maximum(used, 1e-12) * PEAK
+        span = PEAK * np.ptp(s, axis=0) / used
         place = 0.5 + 0.5 * np.tanh(rows[:, -1])
-        return coefficients / used, self.low + place * slack - s.min(axis=0) / used
+        middle = self.low + 0.5 * span + place * (self.high - self.low - span)
+        return coefficients / used, middle - 0.5 * (s.max(axis=0) + s.min(axis=0)) / used
 
     def sample(self, x: Array, waves: tuple[Array, Array, Array] | None = None) -> tuple[Array, Array, Array]:
         """q, dq, ddq (N, n) of the free numbers; by default at the coarse samples."""
@@ -163,7 +166,7 @@ class _Information:
             self.weight = 1.0 / np.maximum(usual, 1e-3 * usual.max())
         A = self._matrix(q, dq, ddq)
         self.scale = np.linalg.norm(A, axis=0) / np.sqrt(len(A))
-        felt = np.flatnonzero(self.scale > 1e-9 * self.scale.max())
+        felt = np.flatnonzero(self.scale > ROUNDING * self.scale.max())
         try:
             from scipy.linalg import qr
         except ImportError:

@@ -265,9 +265,7 @@ def fit(
     links = result.phi
     phi, covariance, share = _final(arm, problem, solution, result, method, prior)
     predicted = problem.predict(phi)
-    seen = problem.known.all(axis=1)
-    if not seen.any():  # a joint that never moves has no known friction; the others still count
-        seen = problem.known.any(axis=1)
+    seen = (problem.known[:, problem.known.any(axis=0)] > 0.0).all(axis=1)
     residuals = Residuals.of(problem.y[seen], predicted[seen], "the fit's own data")
     took = time.perf_counter() - begin
     held, spread = None, _spread(problem, problem.y - predicted)
@@ -482,9 +480,10 @@ def _problem_of(
 
 
 def _held_out(problem: Problem, predicted: Array, what: str) -> tuple[Residuals, tuple[Array, Array]]:
-    seen = problem.known.all(axis=1)
+    # a joint that never moves has no known friction; the others still count
+    seen = (problem.known[:, problem.known.any(axis=0)] > 0.0).all(axis=1)
     if not seen.any():
-        raise LogError(f"{what}: not every joint moves, so friction is unknown throughout")
+        raise LogError(f"{what}: no joint moves, so friction is unknown throughout")
     return Residuals.of(problem.y[seen], predicted[seen], what), _spread(problem, problem.y - predicted)
 
 
