@@ -66,6 +66,8 @@ def rehearse(
         torque[k] = planned[k] + arm.mass_matrix(seen[k]) @ wanted
         if k + 1 < len(time):
             plant.step(torque[k], int(time_ns[k + 1] - time_ns[k]))
+    # each torque holds for the period that follows; a drive reads the mean about the instant
+    effort = np.vstack([torque[:1], 0.5 * (torque[1:] + torque[:-1])])
     broken = []
     peak = np.abs(torque).max(axis=0)
     for j, joint in enumerate(arm.joints):
@@ -89,7 +91,7 @@ def rehearse(
             time_ns=time_ns,
             position=seen,
             velocity=speed,
-            effort=torque,
+            effort=effort,
             joint_names=arm.joint_names,
             meta={"effort_unit": "N m"},
         ),
