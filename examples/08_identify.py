@@ -3,10 +3,10 @@
 Needs palpate[sim,identify]. Prints:
 
     conditioning 7.8, of random motion 12.3
-    conditioning 12.4, of random motion 12.4
-    as described: 29.2 % of the torque unexplained
-    identified: 3.0 % of the torque unexplained
-    A2 Coulomb friction: 4.04 N m, true 4.00 N m
+    conditioning 6.1, of random motion 13.4
+    as described: 29.1 % of the torque unexplained
+    identified: 2.2 % of the torque unexplained
+    A2 Coulomb friction: 4.00 N m, true 4.00 N m
 """
 
 from __future__ import annotations
