@@ -21,8 +21,8 @@ from palpate.identify.consistent import consistent, prior_links
 from palpate.identify.data import RegressionData
 from palpate.identify.regress import LINK_TERMS, RANK, ROUNDING, Base, IndexArray, Problem
 
-ROWS = 400
-"""rows looked at"""
+ROWS = 300
+"""rows looked at, at most"""
 BLOCKS = 10
 """stretches of the data; every other one is kept out"""
 DOUBTFUL = 0.3
@@ -74,7 +74,7 @@ def check_columns(arm: Arm, data: RegressionData, torque: Array) -> None:
     Raises:
         InputError: names the mistake and what to do.
     """
-    step = max(1, len(data) // ROWS)
+    step = max(1, -(-len(data) // ROWS))
     rows = _Rows(data.q[::step], data.dq[::step], data.ddq[::step], torque[::step])
     if len(rows.q) < 4 * BLOCKS or np.all(np.ptp(rows.q, axis=0) < STILL):
         return

@@ -209,11 +209,10 @@ def _torques(fit: Fit, name: str, prediction: Prediction, index: int, count: int
         [("measured", "grey", "line"), ("predicted", "blue", "line"), ("difference", "orange", "line")]
     )
     text = (
-        "Measured torque (effort times gain) and what the identified arm predicts from positions and "
-        "velocities alone. "
-        "The difference should look like noise about zero; a shape that repeats with the motion is "
-        "dynamics the model "
-        "lacks, a step at each reversal is friction."
+        "Measured torque (effort times gain) and what the identified arm predicts from positions and velocities "
+        "alone; nothing is predicted before a joint's first motion, when its friction is unknown. The difference "
+        "should look like noise about zero; a shape that repeats with the motion is dynamics the model lacks, a step "
+        "at each reversal is friction."
     )
     return _page.section(
         f"Torques: {name}", key, f'<div class="panels">{"".join(panels)}</div>', _page.read(text)
@@ -252,8 +251,11 @@ def _welch(prediction: Prediction, cutoff: float) -> tuple[Array, Array, Array] 
     if len(time) < 64:
         return None
     period = float(np.median(np.diff(time)))
-    cuts = np.flatnonzero(np.abs(np.diff(time) - period) > 0.5 * period) + 1
-    longest = max(np.split(np.arange(len(time)), cuts), key=len)
+    # before its first motion a joint's friction is unknown
+    known = prediction.known[:, prediction.known.any(axis=0)].all(axis=1)
+    broken = (np.abs(np.diff(time) - period) > 0.5 * period) | (np.diff(known.astype(int)) != 0)
+    parts = np.split(np.arange(len(time)), np.flatnonzero(broken) + 1)
+    longest = max((part for part in parts if known[part[0]]), key=len, default=parts[0])
     if len(longest) < 64:
         return None
     length = min(len(longest), max(64, round(10.0 / period)))
