@@ -252,7 +252,7 @@ def _welch(prediction: Prediction, cutoff: float) -> tuple[Array, Array, Array] 
         return None
     period = float(np.median(np.diff(time)))
     # before its first motion a joint's friction is unknown
-    known = prediction.known[:, prediction.known.any(axis=0)].all(axis=1)
+    known = np.all(prediction.known[:, np.any(prediction.known, axis=0)], axis=1).reshape(-1)
     broken = (np.abs(np.diff(time) - period) > 0.5 * period) | (np.diff(known.astype(int)) != 0)
     parts = np.split(np.arange(len(time)), np.flatnonzero(broken) + 1)
     longest = max((part for part in parts if known[part[0]]), key=len, default=parts[0])
