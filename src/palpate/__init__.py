@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 from . import robots
 from ._core import (
     Conditioner,
@@ -94,3 +96,12 @@ __all__ = [
     "status_names",
     "tare",
 ]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """``palpate.identify`` is loaded when it is first asked for: it is not needed to sense."""
+    if name == "identify":
+        from importlib import import_module
+
+        return import_module("palpate.identify")
+    raise AttributeError(f"module 'palpate' has no attribute {name!r}")

@@ -10,7 +10,6 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping
-from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -455,7 +454,7 @@ def write_card(arm: Arm, path: str | os.PathLike[str]) -> None:
     links = [*(j.link for j in arm.joints), arm.base]  # index -1 is the base
     content: dict[str, Any] = {
         "palpate_card": 1,
-        "written": {"date": datetime.now(UTC).date().isoformat(), "palpate": _version()},
+        "written": {"palpate": _version()},
         "name": arm.name,
         "base": arm.base,
         "tip": arm.tip,

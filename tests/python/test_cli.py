@@ -20,7 +20,20 @@ from palpate.cli import main
 from palpate.report import StudyRow
 from palpate.studies import Study, StudyResult
 
-VERBS = ("weigh", "feel", "simulate", "replay", "tare", "reproduce", "bench", "doctor", "arm", "data")
+VERBS = (
+    "weigh",
+    "feel",
+    "simulate",
+    "replay",
+    "tare",
+    "identify",
+    "excite",
+    "reproduce",
+    "bench",
+    "doctor",
+    "arm",
+    "data",
+)
 
 
 class Outcome:

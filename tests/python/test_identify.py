@@ -470,7 +470,8 @@ def test_what_was_not_seen_is_said():
     text = "\n".join(found.unseen)
     assert f"{arm.joint_names[2]} moves by" in text
     assert f"{arm.joint_names[3]} never reverses" in text
-    assert "base parameters" in text
+    assert "combinations of rigid parameters" in text and "to see them swing" in text
+    assert found.blind == (2, 3)
     assert all(np.isfinite(e.value) for e in found.parameters)
 
 

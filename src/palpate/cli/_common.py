@@ -164,10 +164,10 @@ def open_log(path: Path, columns: str | None) -> Log:
     """The log, bad rows kept: the pipeline gives them a status."""
     from ..logs import Log
 
-    return Log.open(path, _column_map(columns), keep_invalid=True)
+    return Log.open(path, column_map(columns), keep_invalid=True)
 
 
-def _column_map(text: str | None) -> ColumnMap | None:
+def column_map(text: str | None) -> ColumnMap | None:
     from ..logs import ColumnMap, SignalColumns
 
     if text is None:

@@ -3,6 +3,7 @@
 Functions from data to frozen results; nothing is printed, plotted or written. Needs the extra ``identify``.
 """
 
+from palpate.identify.cad import Body, mesh_body, printed_complaint, with_meshes
 from palpate.identify.currents import (
     PhaseCalibration,
     TorqueConstants,
@@ -10,6 +11,7 @@ from palpate.identify.currents import (
     fit_torque_constants,
 )
 from palpate.identify.data import RegressionData, prepare
+from palpate.identify.excitation import Excitation, excite, to_csv, to_ros
 from palpate.identify.fitting import Estimate, Fit, Prediction, Residuals, fit
 from palpate.identify.friction import Coupling, FrictionModel, FrictionShape
 from palpate.identify.gains import GainFit, KnownLoad, fit_gains
@@ -18,9 +20,11 @@ from palpate.identify.servo import BusDrive, fit_bus_drive
 from palpate.identify.transmission import TransmissionFit, fit_transmission
 
 __all__ = [
+    "Body",
     "BusDrive",
     "Coupling",
     "Estimate",
+    "Excitation",
     "Fit",
     "FrictionModel",
     "FrictionShape",
@@ -35,10 +39,16 @@ __all__ = [
     "TransmissionFit",
     "calibrate_phases",
     "estimate_load",
+    "excite",
     "fit",
     "fit_bus_drive",
     "fit_gains",
     "fit_torque_constants",
     "fit_transmission",
+    "mesh_body",
     "prepare",
+    "printed_complaint",
+    "to_csv",
+    "to_ros",
+    "with_meshes",
 ]

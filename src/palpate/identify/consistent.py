@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from palpate.arm import Arm, Array
 from palpate.errors import InputError
@@ -104,7 +105,7 @@ def consistent(
     H: Array,
     g: Array,
     prior: Array,
-    positive: Array,
+    positive: npt.NDArray[np.intp],
     start: Array,
     *,
     gamma: float = PRIOR,

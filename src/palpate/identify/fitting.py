@@ -12,6 +12,7 @@ import numpy as np
 
 from palpate.arm import Arm, Array, Friction
 from palpate.errors import InputError, LogError
+from palpate.identify.checks import check_columns, not_shown
 from palpate.identify.consistent import PRIOR, ConsistentSolution, body, consistent, prior_links
 from palpate.identify.data import Origin, RegressionData, Segment, prepare
 from palpate.identify.friction import (
@@ -29,6 +30,7 @@ from palpate.identify.regress import (
     Solution,
     base_parameters,
     check_transmission,
+    damped,
     fastest,
     inflation,
     least_squares,
@@ -39,7 +41,8 @@ from palpate.identify.regress import (
 from palpate.logs import Log
 from palpate.logs.repair import BoolArray
 
-Method = Literal["consistent", "irls", "wls", "ols"]
+Method = Literal["consistent", "damped", "irls", "wls", "ols"]
+METHODS: tuple[Method, ...] = ("consistent", "damped", "irls", "wls", "ols")
 LOAD_FRICTION_STD = 0.1
 """prior of the load-dependent friction coefficient [1]: gears that lose more of what they carry are rare"""
 ROUNDS = 3
@@ -58,6 +61,8 @@ class Estimate:
     prior: float
     """what it was before; NaN where nothing was known"""
     unit: str
+    seen: float = math.nan
+    """part of what is known of it that the data say, not the prior [1]; NaN where there is no prior"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +133,7 @@ class Fit:
         friction: the friction model.
         shape: presliding distance and Stribeck velocity of each joint.
         unseen: sentences on what the data did not show.
+        blind: indices of joints whose friction the data cannot tell; the arm keeps what it had for them.
         origins: what became of each log.
         phi: (p,) the parameters as numbers; covariance: (p, p).
         sigma: (n,) robust standard deviation of the residual [N m].
@@ -146,6 +152,7 @@ class Fit:
     friction: FrictionModel
     shape: FrictionShape
     unseen: tuple[str, ...]
+    blind: tuple[int, ...]
     origins: tuple[Origin, ...]
     phi: Array
     covariance: Array
@@ -274,8 +281,9 @@ def fit(
         logs: free motion, one or several logs of the same arm.
         friction: ``coulomb``, ``stribeck``, ``load``, ``stribeck+load`` or a :class:`FrictionModel`.
         couplings: drives that turn with several joints (with ``friction`` as a name).
-        method: ``consistent`` (links that can exist), or least squares ``irls``, ``wls``, ``ols``: then
-            ``phi`` is the solution nearest to the prior and the arm gets the nearest links that can exist.
+        method: ``consistent`` (links that can exist), ``damped`` (pulled to the arm's own figures, by one standard
+            deviation of 1 SI unit over the root of ``prior``), or least squares ``irls``, ``wls``, ``ols``: then
+            ``phi`` is the solution nearest to the prior; the arm gets the nearest links that can exist.
         cutoff: parallel low-pass [Hz]; default: from the motion, see :func:`palpate.identify.prepare`.
         effort: name of a signal to take instead of the logs' effort [N m], e.g. a joint torque sensor's.
         weights: per log, of its squared residuals.
@@ -293,47 +301,46 @@ def fit(
     """
     begin = time.perf_counter()
     model = friction if isinstance(friction, FrictionModel) else FrictionModel.named(friction, couplings)
-    if method not in ("consistent", "irls", "wls", "ols"):
-        raise InputError(f"method must be consistent, irls, wls or ols, got {method!r}")
+    if method not in METHODS:
+        raise InputError(f"method must be {', '.join(METHODS)}, got {method!r}")
     every = (logs,) if isinstance(logs, Log) else tuple(logs)
     check_joints(arm, every)
     data = prepare(every, cutoff=cutoff, effort=effort, weights=weights)
     gain = np.ones(arm.n) if effort is not None else check_effort(arm, data)
+    if transmission is None:  # else a column is a motor's, not a joint's
+        check_columns(arm, data, data.effort * gain)
     check_motion(arm, data)
     drives = check_transmission(transmission, arm.n)
     builder = Builder(arm, data, data.effort * gain, transmission=drives)
     data = builder.data
-    problem, solution = solve_shape(builder, model, method="irls" if method == "consistent" else method)
+    problem, solution = solve_shape(builder, model, method=_least_squares(method))
     base = base_parameters(problem, solution, structural_rank=structural_rank(arm, model))
     least = time.perf_counter() - begin
     result = _consistent(arm, problem, solution, prior)
-    phi, covariance = (result.phi, result.covariance)
-    links = phi
-    if method != "consistent":
-        phi = solution.phi
+    links = result.phi
+    phi, covariance, share = _final(arm, problem, solution, result, method, prior)
     predicted = problem.predict(phi)
-    seen = problem.known.all(axis=1)
-    if not seen.any():  # a joint that never moves has no known friction; the others still count
-        seen = problem.known.any(axis=1)
+    seen = (problem.known[:, problem.known.any(axis=0)] > 0.0).all(axis=1)
     residuals = Residuals.of(problem.y[seen], predicted[seen], "the fit's own data")
     took = time.perf_counter() - begin
     held, spread = None, _spread(problem, problem.y - predicted)
     if validate_on is not None:
         others = (validate_on,) if isinstance(validate_on, Log) else tuple(validate_on)
         unseen = _problem_of(arm, others, problem, phi, data.cutoff, effort, gain, drives)
-        held, spread = _held_out(unseen, unseen.predict(phi), "validate_on")
+        held, spread = _held_out(unseen, unseen.predict(phi), "logs the fit has not seen")
     elif cross_validate:
         held, spread = _held_out(*_cross_validate(builder, problem, method, prior))
-    estimates = _table(arm, problem, phi, covariance)
+    gaps = not_shown(arm, problem, base)
     return Fit(
-        arm=identified(arm, problem, links, data, gain, every),
-        parameters=estimates,
+        arm=_keep(arm, identified(arm, problem, links, data, gain, every), gaps.joints),
+        parameters=_table(arm, problem, phi, covariance, share),
         base=base,
         residuals=residuals,
         held_out=held,
         friction=model,
         shape=problem.shape,
-        unseen=_unseen(arm, problem, base),
+        unseen=gaps.sentences,
+        blind=gaps.joints,
         origins=data.origins,
         phi=phi,
         covariance=covariance,
@@ -417,29 +424,6 @@ def check_motion(arm: Arm, data: RegressionData) -> None:
         )
 
 
-def _unseen(arm: Arm, problem: Problem, base: Base) -> tuple[str, ...]:
-    """What the data did not show, in words."""
-    found = []
-    data = problem.data
-    for j, joint in enumerate(arm.joints):
-        span = float(np.ptp(data.q[:, j]))
-        forward = bool(np.any(data.dq[:, j] > 0.01))
-        backward = bool(np.any(data.dq[:, j] < -0.01))
-        if span < 0.05:
-            found.append(f"{joint.name} moves by {span:.2g} rad only: its friction and inertia are guesses")
-        elif not (forward and backward):
-            found.append(
-                f"{joint.name} never reverses: its Coulomb friction and offset cannot be told apart; "
-                "record it in both directions"
-            )
-    missing = base.structural_rank - base.rank
-    if missing > 0:
-        found.append(
-            f"{missing} of {base.structural_rank} base parameters: more varied motion would show them"
-        )
-    return tuple(found)
-
-
 # -- solving ----------------------------------------------------------------------------------------------------------
 
 
@@ -485,8 +469,33 @@ def _consistent(arm: Arm, problem: Problem, solution: Solution, prior: float) ->
     return consistent(H, g, prior_links(arm), np.array(positive), start, gamma=prior)
 
 
+def _least_squares(method: Method) -> str:
+    """What finds weights and friction's shape for a method."""
+    return "irls" if method in ("consistent", "damped") else method
+
+
+def _final(
+    arm: Arm,
+    problem: Problem,
+    solution: Solution,
+    result: ConsistentSolution,
+    method: Method,
+    prior: float,
+) -> tuple[Array, Array, Array]:
+    """phi (p,), its covariance (p, p), and the part of each parameter's information that is the data's (p,)."""
+    H, _ = information(problem, solution)
+    covariance = result.covariance
+    phi = result.phi if method == "consistent" else solution.phi
+    if method == "damped":
+        weights = solution.weights / solution.inflation
+        phi = damped(problem, _start(arm, problem), math.sqrt(prior), weights=weights)
+        covariance = np.asarray(np.linalg.inv(H + prior * np.eye(len(phi))), dtype=np.float64)
+    share = np.einsum("ij,ji->i", covariance, H)
+    return phi, covariance, share.clip(0.0, 1.0)
+
+
 def _cross_validate(
-    builder: Builder, problem: Problem, method: str, prior: float
+    builder: Builder, problem: Problem, method: Method, prior: float
 ) -> tuple[Problem, Array, str]:
     """Predict each log (or third of the only one) from the others; the friction's shape is kept."""
     data = problem.data
@@ -501,12 +510,13 @@ def _cross_validate(
         train = replace(problem, known=problem.known * (fold != k)[:, None])
         solution = least_squares(
             train,
-            method="irls" if method == "consistent" else method,
+            method=_least_squares(method),
             phi0=_start(builder.arm, train),
         )
         phi = solution.phi
-        if method == "consistent":
-            phi = _consistent(builder.arm, train, solution, prior).phi
+        if method in ("consistent", "damped"):
+            result = _consistent(builder.arm, train, solution, prior)
+            phi = _final(builder.arm, train, solution, result, method, prior)[0]
         predicted[fold == k] = problem.predict(phi)[fold == k]
     return problem, predicted, what
 
@@ -528,9 +538,10 @@ def _problem_of(
 
 
 def _held_out(problem: Problem, predicted: Array, what: str) -> tuple[Residuals, tuple[Array, Array]]:
-    seen = problem.known.all(axis=1)
+    # a joint that never moves has no known friction; the others still count
+    seen = (problem.known[:, problem.known.any(axis=0)] > 0.0).all(axis=1)
     if not seen.any():
-        raise LogError(f"{what}: not every joint moves, so friction is unknown throughout")
+        raise LogError(f"{what}: no joint moves, so friction is unknown throughout")
     return Residuals.of(problem.y[seen], predicted[seen], what), _spread(problem, problem.y - predicted)
 
 
@@ -544,15 +555,26 @@ def _spread(problem: Problem, error: Array) -> tuple[Array, Array]:
 # -- results ----------------------------------------------------------------------------------------------------------
 
 
-def _table(arm: Arm, problem: Problem, phi: Array, covariance: Array) -> tuple[Estimate, ...]:
+def _table(arm: Arm, problem: Problem, phi: Array, covariance: Array, share: Array) -> tuple[Estimate, ...]:
     prior = np.full(len(phi), np.nan)
     if arm.has_dynamics:
         prior[: 10 * arm.n] = prior_links(arm).ravel()
     std = np.sqrt(np.diag(covariance))
     return tuple(
-        Estimate(p.name, float(v), float(s), float(b), p.unit)
-        for p, v, s, b in zip(problem.parameters, phi, std, prior, strict=True)
+        Estimate(p.name, float(v), float(s), float(b), p.unit, float(part))
+        for p, v, s, b, part in zip(problem.parameters, phi, std, prior, share, strict=True)
     )
+
+
+def _keep(arm: Arm, found: Arm, blind: Sequence[int]) -> Arm:
+    """The arm found, with the friction and rotor of joints the data say nothing of as they were."""
+    joints = [
+        j.replace(friction=arm.joints[i].friction, rotor_inertia=arm.joints[i].rotor_inertia)
+        if i in blind
+        else j
+        for i, j in enumerate(found.joints)
+    ]
+    return found.replace(joints=tuple(joints))
 
 
 def identified(

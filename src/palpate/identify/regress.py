@@ -45,6 +45,9 @@ FELT = 1e-3
 RANK = 1e-5
 """singular values of the column-scaled regressor below this part of the largest are not seen"""
 
+ROUNDING = 1e-9
+"""a column shorter than this part of the longest holds rounding errors only"""
+
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
@@ -556,6 +559,8 @@ def structural_rank(arm: Arm, model: FrictionModel) -> int:
         A[:, np.arange(arm.n), 10 * arm.n + np.arange(arm.n)] = ddq
     stacked = A.reshape(-1, p)
     scale = np.linalg.norm(stacked, axis=0)
-    singular = np.linalg.svd(stacked / np.where(scale > 0.0, scale, 1.0), compute_uv=False)
+    # a column of rounding errors is no parameter
+    stacked = stacked[:, scale > ROUNDING * scale.max()]
+    singular = np.linalg.svd(stacked / np.linalg.norm(stacked, axis=0), compute_uv=False)
     friction = p - 10 * arm.n - (arm.n if model.rotor_inertia else 0)
     return int(np.count_nonzero(singular > RANK * singular[0])) + friction

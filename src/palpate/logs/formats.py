@@ -28,9 +28,56 @@ from palpate.logs.repair import (
 )
 
 _JSON_LIMIT = 256 << 20  # [bytes]; a recording of minutes takes one or two MB
+_LEAST_ROWS = 16  # fewer show no derivative
 _TX40_RATIO = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
 _TX40_RATIO[5, 4] = 32.0  # motor 6 turns with joint 5, too
 _TX40_RATIO.setflags(write=False)
+
+
+def open_known(path: str | PathLike[str], joints: int) -> tuple[Log, str | None]:
+    """A log in palpate's own layout, or in that of a known data set, found out by what is in it.
+
+    Args:
+        path: the file.
+        joints: how many joints the log must have.
+
+    Returns:
+        the log, and the name of the column map where one was needed.
+
+    Raises:
+        LogError: the file cannot be read, or no layout fits.
+    """
+    try:
+        return Log.open(path), None
+    except LogError:
+        if not Path(path).is_file():
+            raise
+        for name in ColumnMap.names():
+            try:
+                log = Log.open(path, ColumnMap.named(name))
+            except LogError:
+                continue
+            if log.n != joints:
+                continue
+            if len(log) < _LEAST_ROWS:
+                raise LogError(f"{path}: {len(log)} rows: too few to tell what its columns are") from None
+            if _moves_as_it_says(log):
+                return log, name
+        raise
+
+
+def _moves_as_it_says(log: Log) -> bool:
+    """Whether time runs and the velocity is the derivative of the position: columns of another layout are not."""
+    if log.velocity is None:
+        return False
+    time = log.seconds
+    good = np.r_[np.diff(time) > 0.0, False]
+    if np.count_nonzero(good) < 0.9 * len(log):
+        return False
+    travelled = np.diff(log.position, axis=0)[good[:-1]]
+    told = (0.5 * (log.velocity[1:] + log.velocity[:-1]) * np.diff(time)[:, None])[good[:-1]]
+    size = float(np.linalg.norm(told))
+    return bool(size > 0.0 and np.linalg.norm(travelled - told) < 0.5 * size)
 
 
 def read_motor_pair(

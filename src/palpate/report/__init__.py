@@ -14,6 +14,7 @@ from .figures import (
     table_figure,
     torque_figure,
 )
+from .identify import write_identify_report
 from .study import StudyFiles, StudyRow, markdown_table, update_markdown, write_study
 from .weigh import write_weigh_report
 from .weighing import WeighReport
@@ -35,6 +36,7 @@ __all__ = [
     "torque_figure",
     "update_markdown",
     "write_feel_report",
+    "write_identify_report",
     "write_study",
     "write_weigh_report",
 ]

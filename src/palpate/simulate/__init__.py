@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from ._render import Camera
+from .clearance import Clearance
 from .plant import Integrator, Load, Plant, Truth
+from .rehearsal import Rehearsal, rehearse
 from .scenarios import Attach, Push, Release, ScenarioEvent, Schedule, StopPushing, pick_and_place
 from .sensing import Fault, FaultKind, SensorModel
 
 __all__ = [
     "Attach",
     "Camera",
+    "Clearance",
     "Fault",
     "FaultKind",
     "Integrator",
     "Load",
     "Plant",
     "Push",
+    "Rehearsal",
     "Release",
     "ScenarioEvent",
     "Schedule",
@@ -23,4 +27,5 @@ __all__ = [
     "StopPushing",
     "Truth",
     "pick_and_place",
+    "rehearse",
 ]
