@@ -35,7 +35,7 @@ LOAD_FRICTION_STD = 0.1
 """prior of the load-dependent friction coefficient [1]: gears that lose more of what they carry are rare"""
 ROUNDS = 3
 """rounds of friction shape, load torque and least squares; the third changes nothing that shows"""
-POSITIVE = ("rotor", "coulomb", "viscous", "load")
+POSITIVE = ("rotor", "coulomb", "viscous", "load", "stiffness")
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +272,7 @@ def fit(
         held, spread = _held_out(*_cross_validate(builder, problem, method, prior))
     estimates = _table(arm, problem, phi, covariance)
     return Fit(
-        arm=identified(arm, problem, links, data, gain, every),
+        arm=identified(arm, problem, links, data, gain),
         parameters=estimates,
         base=base,
         residuals=residuals,
@@ -498,9 +498,7 @@ def _table(arm: Arm, problem: Problem, phi: Array, covariance: Array) -> tuple[E
     )
 
 
-def identified(
-    arm: Arm, problem: Problem, phi: Array, data: RegressionData, gain: Array, logs: Sequence[Log]
-) -> Arm:
+def identified(arm: Arm, problem: Problem, phi: Array, data: RegressionData, gain: Array) -> Arm:
     """The arm with the links, friction, rotor inertias and noise found."""
     joints = []
     for i, joint in enumerate(arm.joints):
@@ -518,7 +516,6 @@ def identified(
             velocity = problem.shape.stribeck_velocity[i]
         # the card's friction has no memory: its smooth sign is made as narrow as the speeds seen allow
         sign = float(np.clip(problem.shape.presliding[i] * data.cutoff, 1e-3, 1e-2))
-        resolution = _resolution(np.concatenate([log.position[:, i] for log in logs]))
         joints.append(
             joint.replace(
                 mass=mass,
@@ -538,7 +535,7 @@ def identified(
                 ),
                 sensing=replace(
                     joint.sensing,
-                    position_resolution=resolution,
+                    position_resolution=float(data.resolution[i]),
                     torque_std=float(abs(gain[i]) * data.noise[i]),
                 ),
             )
@@ -549,13 +546,3 @@ def identified(
         "friction": "+".join(problem.model.terms) + ", sign remembered over a presliding distance",
     }
     return arm.replace(joints=tuple(joints), provenance=provenance)
-
-
-def _resolution(position: Array) -> float:
-    """Smallest step between different readings [rad]; 0 if they look continuous."""
-    values = np.unique(position)
-    if len(values) < 3:
-        return 0.0
-    step = float(np.min(np.diff(values)))
-    # a count repeats: readings on a grid have far fewer values than samples
-    return step if len(values) < 0.5 * len(position) or step > 1e-7 else 0.0

@@ -59,6 +59,7 @@ class FrictionModel:
 
     stribeck: bool = False
     load: bool = False
+    spring: bool = False
     rotor_inertia: bool = True
     presliding: tuple[float, ...] = PRESLIDING
     velocities: tuple[float, ...] = STRIBECK
@@ -80,9 +81,9 @@ class FrictionModel:
             InputError: another name.
         """
         parts = set(name.split("+")) - {"coulomb"}
-        if not parts <= {"stribeck", "load"}:
+        if not parts <= {"stribeck", "load", "spring"}:
             raise InputError(f"friction must be coulomb, stribeck, load or stribeck+load, got {name!r}")
-        return cls(stribeck="stribeck" in parts, load="load" in parts, couplings=tuple(couplings))
+        return cls(stribeck="stribeck" in parts, load="load" in parts, spring="spring" in parts, couplings=tuple(couplings))
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -93,6 +94,7 @@ class FrictionModel:
             "offset",
             *(("stribeck",) if self.stribeck else ()),
             *(("load",) if self.load else ()),
+            *(("stiffness",) if self.spring else ()),
         )
 
 
@@ -160,6 +162,8 @@ def columns(
         if load_torque is None:
             raise InputError("load-dependent friction needs the load torque")
         parts.append(z * np.abs(load_torque))
+    if model.spring:
+        parts.append(segment.q)
     return np.stack(parts, axis=2)
 
 

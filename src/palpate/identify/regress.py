@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from palpate.arm import Arm, Array
 from palpate.errors import InputError
-from palpate.identify.data import RegressionData, Segment
+from palpate.identify.data import KINEMATIC_RATIO, RegressionData, Segment
 from palpate.identify.friction import (
     FrictionModel,
     FrictionShape,
@@ -33,6 +33,7 @@ _FRICTION_UNITS = {
     "offset": "N m",
     "stribeck": "N m",
     "load": "1",
+    "stiffness": "N m/rad",
 }
 HUBER = 1.345
 """residuals beyond this many standard deviations count linearly: 95 % efficient on normal noise"""
@@ -164,7 +165,7 @@ class Builder:
         # until a joint has moved, nobody knows what friction it stopped with before the log
         moved = data.reduce(lambda s: (np.cumsum(np.abs(s.dq), axis=0) / s.rate > KNOWN_AFTER).astype(float))
         self.known = (moved > 0.99).astype(np.float64)
-        slow = REST * fastest(data)
+        slow = slowest(data)
         self.rest = data.reduce(lambda s: 1.0 - np.square(np.tanh(s.dq / slow))).clip(0.0, 1.0)
         self.rigid: list[Array] = []
         for j in range(n):
@@ -249,7 +250,7 @@ class Builder:
         for j in range(n):
             at, A = problem.blocks[j]
             own = [k for k, i in enumerate(at) if problem.parameters[i].kind in _FRICTION_UNITS]
-            kept = [k for k in own if problem.parameters[at[k]].kind in ("viscous", "offset", "load")]
+            kept = [k for k in own if problem.parameters[at[k]].kind in ("viscous", "offset", "load", "stiffness")]
             root = np.sqrt(solution.weights[:, j])
             rest = (problem.y[:, j] - A @ solution.phi[at] + A[:, own] @ solution.phi[at[own]]) * root
             fixed = A[:, kept] * root[:, None]
@@ -269,6 +270,16 @@ class Builder:
 def fastest(data: RegressionData) -> Array:
     """(n,) largest speed of each joint in the data [rad/s], at least 1e-6."""
     return np.maximum(np.abs(data.dq).max(axis=0), 1e-6)
+
+
+def slowest(data: RegressionData) -> Array:
+    """(n,) speed below which a joint counts as at rest [rad/s].
+
+    A part of its fastest speed, but no less than what one step of the encoder looks like after the kinematic
+    low-pass: a peak of twice the cutoff times the step.
+    """
+    step: Array = 2.0 * KINEMATIC_RATIO * data.cutoff * data.resolution
+    return np.maximum(REST * fastest(data), step)
 
 
 def normal(problem: Problem, weights: Array) -> tuple[Array, Array]:
