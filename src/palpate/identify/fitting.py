@@ -35,6 +35,10 @@ LOAD_FRICTION_STD = 0.1
 """prior of the load-dependent friction coefficient [1]: gears that lose more of what they carry are rare"""
 ROUNDS = 3
 """rounds of friction shape, load torque and least squares; the third changes nothing that shows"""
+FRICTION_DRIFT = 0.1
+"""part of its value by which friction differs from log to log (temperature), one standard deviation"""
+DRIFTING = ("coulomb", "viscous", "offset")
+"""friction that differs from log to log"""
 POSITIVE = ("rotor", "coulomb", "viscous", "load", "stiffness")
 
 

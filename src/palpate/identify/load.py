@@ -10,12 +10,10 @@ from palpate.arm import Array
 from palpate.errors import InputError, LogError
 from palpate.identify.consistent import link_parameters
 from palpate.identify.data import prepare
-from palpate.identify.fitting import Fit, check_joints
+from palpate.identify.fitting import DRIFTING, FRICTION_DRIFT, Fit, check_joints
 from palpate.identify.regress import HUBER, Builder, Problem
 from palpate.logs import Log
 
-FRICTION_DRIFT = 0.1
-"""part of its value by which friction may differ from the free logs' (temperature), one standard deviation"""
 GAIN_STD = 0.02
 """standard deviation of a drive's torque scale between the free logs and the load [1], where the arm states
 none: magnets lose 0.1 to 0.2 % per kelvin and friction in the gear is not the same under load"""
@@ -132,7 +130,7 @@ class LoadProblem:
         fit = self.fit
         n = self.builder.arm.n
         terms = [
-            (k, p) for k, p in enumerate(problem.parameters) if p.kind in ("coulomb", "viscous", "offset")
+            (k, p) for k, p in enumerate(problem.parameters) if p.kind in DRIFTING
         ]
         place = {k: 10 + i for i, (k, _) in enumerate(terms)}
         size = 10 + len(terms)
@@ -185,7 +183,7 @@ class LoadProblem:
 
     def _prior(self, before: Array, parameters: int) -> tuple[Array, Array]:
         """Where the load's parameters are expected, and how firmly: (p,), (p,) 1/variance."""
-        drifting = sum(p.kind in ("coulomb", "viscous", "offset") for p in self.problem.parameters)
+        drifting = sum(p.kind in DRIFTING for p in self.problem.parameters)
         size = 10 + drifting
         centre, precision = np.zeros(size), np.zeros(size)
         mass = float(before[0])
