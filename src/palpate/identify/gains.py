@@ -25,9 +25,16 @@ from palpate.arm import Arm, Array, Effort
 from palpate.errors import InputError
 from palpate.identify.consistent import link_parameters, prior_links
 from palpate.identify.data import prepare
-from palpate.identify.fitting import DRIFTING, FRICTION_DRIFT, LOAD_FRICTION_STD, check_joints, check_motion
+from palpate.identify.fitting import (
+    DRIFTING,
+    FRICTION_DRIFT,
+    GAIN_STD,
+    LOAD_FRICTION_STD,
+    check_joints,
+    check_motion,
+)
 from palpate.identify.friction import FrictionModel, FrictionShape
-from palpate.identify.load import GAIN_STD, GYRATION
+from palpate.identify.load import GYRATION
 from palpate.identify.regress import HUBER, Builder, Problem, fastest, inflation, least_squares
 from palpate.logs import Log
 from palpate.logs.repair import BoolArray

@@ -14,9 +14,6 @@ from palpate.identify.fitting import DRIFTING, FRICTION_DRIFT, Fit, check_joints
 from palpate.identify.regress import HUBER, Builder, Problem
 from palpate.logs import Log
 
-GAIN_STD = 0.02
-"""standard deviation of a drive's torque scale between the free logs and the load [1], where the arm states
-none: magnets lose 0.1 to 0.2 % per kelvin and friction in the gear is not the same under load"""
 GYRATION = 0.1
 """radius of gyration of a load [m] that its inertia is expected to stay near"""
 MASS_RANGE, MOMENT_RANGE = 50.0, 25.0
@@ -55,7 +52,8 @@ def estimate_load(fit: Fit, log: Log, *, parameters: int = 10, drift: float = FR
     The torque the free model leaves is fitted by the load's parameters, robustly, and by changes of friction of
     ``drift`` of its size. The inertia is expected near that of a body of 0.1 m radius of gyration. The error of
     the free model enters with the size and the memory it had on data held out, and the drives' scale with the
-    doubt the arm states (2 % where it states none): that, and not the number of rows, makes the interval.
+    doubt the arm states, or else with what it differed by between the free logs (see :attr:`Fit.scale_std`):
+    that, and not the number of rows, makes the interval.
 
     Args:
         fit: from free motion.
@@ -170,7 +168,8 @@ class LoadProblem:
             # the rest follows the mass exactly
             x[:10] = x[0] * self._unit_point()
         # the drives' scales are considered, not estimated: a window cannot tell them from the load
-        doubt = np.array([j.sensing.torque_gain_std or GAIN_STD for j in self.builder.arm.joints])
+        stated = np.array([j.sensing.torque_gain_std for j in self.builder.arm.joints])
+        doubt = np.where(stated > 0.0, stated, fit.scale_std)
         through = (inverse @ scaled) * doubt
         inverse = inverse + through @ through.T
         residual = left - np.column_stack([B @ x[to] for to, B in wide])
