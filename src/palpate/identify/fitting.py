@@ -36,7 +36,8 @@ LOAD_FRICTION_STD = 0.1
 ROUNDS = 3
 """rounds of friction shape, load torque and least squares; the third changes nothing that shows"""
 FRICTION_DRIFT = 0.1
-"""part of its value by which friction differs from log to log (temperature), one standard deviation"""
+"""standard deviation of friction from log to log, as a part of its value [1], before any was compared (temperature,
+wear, grease). Worth one log."""
 GAIN_STD = 0.02
 """standard deviation of a drive's torque scale from log to log [1] before any was compared: magnets lose 0.1 to
 0.2 % per kelvin, and friction in the gear is not the same under load. Worth one log."""
@@ -135,6 +136,8 @@ class Fit:
         error_inflation: (n,) rows per independent one of that error [1].
         scale_std: (n,) standard deviation of the drives' torque scale from log to log [1]: from each log's measured
             against its predicted torque where logs were held out, with 2 % for one log more; else 2 %.
+        drift_std: (n,) standard deviation of friction from log to log, as a part of its value [1]: likewise, with
+            10 % for one log more; else 10 %.
         seconds: time the fit took, least squares alone and in all [s].
     """
 
@@ -154,6 +157,7 @@ class Fit:
     error_std: Array
     error_inflation: Array
     scale_std: Array
+    drift_std: Array
     cutoff: float
     method: Method
     seconds: tuple[float, float]
@@ -273,14 +277,13 @@ def fit(
         seen = problem.known.any(axis=1)
     residuals = Residuals.of(problem.y[seen], predicted[seen], "the fit's own data")
     took = time.perf_counter() - begin
-    held, spread = None, _spread(problem, problem.y - predicted)
-    scale_std = np.full(arm.n, GAIN_STD)
+    held, doubt = None, _doubt(problem, predicted, phi)
     if validate_on is not None:
         others = (validate_on,) if isinstance(validate_on, Log) else tuple(validate_on)
         unseen = _problem_of(arm, others, problem, phi, data.cutoff, effort, gain)
-        held, spread, scale_std = _held_out(unseen, unseen.predict(phi), "validate_on")
+        held, doubt = _held_out(unseen, unseen.predict(phi), "validate_on", phi)
     elif cross_validate:
-        held, spread, scale_std = _held_out(*_cross_validate(builder, problem, method, prior))
+        held, doubt = _held_out(*_cross_validate(builder, problem, method, prior), phi)
     estimates = _table(arm, problem, phi, covariance)
     return Fit(
         arm=identified(arm, problem, links, data, gain),
@@ -296,9 +299,10 @@ def fit(
         covariance=covariance,
         sigma=solution.sigma,
         inflation=solution.inflation,
-        error_std=spread[0],
-        error_inflation=spread[1],
-        scale_std=scale_std,
+        error_std=doubt.error_std,
+        error_inflation=doubt.error_inflation,
+        scale_std=doubt.scale_std,
+        drift_std=doubt.drift_std,
         cutoff=data.cutoff,
         method=method,
         seconds=(least, took),
@@ -482,35 +486,58 @@ def _problem_of(
     return Builder(arm, data, data.effort * gain).problem(problem.model, problem.shape, phi)
 
 
-def _held_out(
-    problem: Problem, predicted: Array, what: str
-) -> tuple[Residuals, tuple[Array, Array], Array]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Doubt:
+    """How far a prediction may be off; see the attributes of :class:`Fit`."""
+
+    error_std: Array
+    error_inflation: Array
+    scale_std: Array
+    drift_std: Array
+
+
+def _held_out(problem: Problem, predicted: Array, what: str, phi: Array) -> tuple[Residuals, _Doubt]:
     seen = problem.known.all(axis=1)
     if not seen.any():
         raise LogError(f"{what}: not every joint moves, so friction is unknown throughout")
-    residuals = Residuals.of(problem.y[seen], predicted[seen], what)
-    return residuals, _spread(problem, problem.y - predicted), _scale_std(problem, predicted)
+    return Residuals.of(problem.y[seen], predicted[seen], what), _doubt(problem, predicted, phi, held=True)
 
 
-def _scale_std(problem: Problem, predicted: Array) -> Array:
-    """Standard deviation of the drives' scales (n,) from each held-out log's torque on its prediction."""
-    logs = np.unique(problem.data.log)
-    if len(logs) < 2:  # parts of one log share its temperature
-        return np.full(problem.y.shape[1], GAIN_STD)
-    squares = np.full(problem.y.shape[1], GAIN_STD**2)
-    for log in logs:
-        weight = problem.known * (problem.data.log == log)[:, None]
-        size = np.sum(weight * np.square(predicted), axis=0)
-        scale = np.sum(weight * predicted * problem.y, axis=0) / np.where(size > 0.0, size, np.inf)
-        squares += np.where(size > 0.0, np.square(scale - 1.0), GAIN_STD**2)
-    return np.sqrt(squares / (1 + len(logs)))
-
-
-def _spread(problem: Problem, error: Array) -> tuple[Array, Array]:
-    """Standard deviation of the error in motion (n,) and rows per independent one (n,)."""
+def _doubt(problem: Problem, predicted: Array, phi: Array, *, held: bool = False) -> _Doubt:
+    """From the error in motion; scale and friction are compared where several logs were held out."""
+    error = problem.y - predicted
     moving = problem.known * (problem.rest < 0.1)
     rows = np.maximum(1.0, moving.sum(axis=0))
-    return np.sqrt(np.sum(np.square(error) * moving, axis=0) / rows), inflation(problem, error * moving)
+    std = np.sqrt(np.sum(np.square(error) * moving, axis=0) / rows)
+    memory = inflation(problem, error * moving)
+    n = problem.y.shape[1]
+    scale, drift = np.full(n, GAIN_STD**2), np.full(n, FRICTION_DRIFT**2)
+    logs = np.unique(problem.data.log)
+    compared = len(logs) if held and len(logs) > 1 else 0  # parts of one log share its temperature
+    for log in logs[:compared]:
+        for j in range(n):
+            weight = moving[:, j] * (problem.data.log == log)
+            size = float(weight @ np.square(predicted[:, j]))
+            off = float(weight @ (predicted[:, j] * error[:, j])) / size if size > 0.0 else GAIN_STD
+            scale[j] += off**2
+            drift[j] += _change(problem, j, phi, error[:, j], weight / max(std[j] ** 2 * memory[j], 1e-300))
+    return _Doubt(std, memory, np.sqrt(scale / (1 + compared)), np.sqrt(drift / (1 + compared)))
+
+
+def _change(problem: Problem, joint: int, phi: Array, error: Array, weight: Array) -> float:
+    """Mean square of a joint's change of friction in some rows, as a part of its value: estimate and its variance."""
+    at, A = problem.blocks[joint]
+    own = [k for k, i in enumerate(at) if problem.parameters[i].kind in DRIFTING]
+    X = A[:, own] * [friction_size(problem, phi, int(at[k])) for k in own]
+    inverse = np.linalg.inv((X * weight[:, None]).T @ X + np.eye(len(own)) / FRICTION_DRIFT**2)
+    found = inverse @ (X.T @ (weight * error))
+    return float(np.mean(np.square(found) + np.diag(inverse)))
+
+
+def friction_size(problem: Problem, phi: Array, index: int) -> float:
+    """What the changes of a friction parameter are measured by: its value, an offset's by the Coulomb friction."""
+    p = problem.parameters[index]
+    return float(abs(phi[problem.index("coulomb", p.index) if p.kind == "offset" else index]))
 
 
 # -- results ----------------------------------------------------------------------------------------------------------

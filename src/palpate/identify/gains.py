@@ -32,6 +32,7 @@ from palpate.identify.fitting import (
     LOAD_FRICTION_STD,
     check_joints,
     check_motion,
+    friction_size,
 )
 from palpate.identify.friction import FrictionModel, FrictionShape
 from palpate.identify.load import GYRATION
@@ -362,13 +363,11 @@ def _normal(
     """
     at, B = wide[joint]
     y = problem.y[:, joint]
-    level = abs(phi[problem.index("coulomb", joint)])
     columns, precision = [], []
     for k, i in enumerate(at[:-10]):
-        kind = problem.parameters[i].kind
-        if kind not in DRIFTING:
+        if problem.parameters[i].kind not in DRIFTING:
             continue
-        size = FRICTION_DRIFT * (level if kind == "offset" else abs(phi[i])) * abs(inverse)
+        size = FRICTION_DRIFT * friction_size(problem, phi, int(i)) * abs(inverse)
         for log in np.unique(problem.data.log):
             columns.append(B[:, k] * (problem.data.log == log))
             precision.append(1.0 / max(size, 1e-9) ** 2)
