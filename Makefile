@@ -127,7 +127,6 @@ bench: $(VENV)/.bench
 	  -DCMAKE_PREFIX_PATH="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))')/cmeel.prefix"
 	@$(BIN)/cmake --build build/bench -- --quiet
 	@set -e; for program in build/bench/benchmarks/benchmark_*; do [ ! -x $$program ] || $$program; done
-	@set -e; for script in benchmarks/*.py; do [ ! -f $$script ] || $(BIN)/python $$script; done
 
 format: $(VENV)/.test
 	$(PIP_INSTALL) "clang-format>=18"

@@ -245,7 +245,7 @@ def prepare(
 def _resolution(position: Array) -> float:
     """Smallest step between different readings [rad]; 0 if they look continuous."""
     values = np.unique(position[np.isfinite(position)])
-    if len(values) < 3:
+    if len(values) < 2:
         return 0.0
     step = float(np.min(np.diff(values)))
     # a count repeats: readings on a grid have far fewer values than samples

@@ -51,6 +51,8 @@ class FrictionModel:
         stribeck: adds (F_s - F_c) exp(-(dq/v_s)^2), v_s searched; F_s < F_c (less friction at low speed, the
             concave curve of many harmonic drives) is allowed.
         load: adds load |tau_load| to F_c.
+        spring: adds k q, k >= 0: a harness or hose that turns with the joint pulls it back. An arm card has no
+            springs: what it says is then k q off.
         rotor_inertia: fits I_a ddq.
         presliding: distances x_0 tried [rad]; one value fixes it.
         velocities: Stribeck velocities v_s tried, as parts of the joint's fastest speed [1].
@@ -75,15 +77,22 @@ class FrictionModel:
 
     @classmethod
     def named(cls, name: str, couplings: Sequence[Coupling] = ()) -> FrictionModel:
-        """``"coulomb"``, ``"stribeck"``, ``"load"`` or ``"stribeck+load"``.
+        """``"coulomb"``, or ``"stribeck"``, ``"load"``, ``"spring"`` joined by ``+``.
 
         Raises:
             InputError: another name.
         """
         parts = set(name.split("+")) - {"coulomb"}
         if not parts <= {"stribeck", "load", "spring"}:
-            raise InputError(f"friction must be coulomb, stribeck, load or stribeck+load, got {name!r}")
-        return cls(stribeck="stribeck" in parts, load="load" in parts, spring="spring" in parts, couplings=tuple(couplings))
+            raise InputError(
+                f"friction must be coulomb, or stribeck, load, spring joined by +, e.g. stribeck+load; got {name!r}"
+            )
+        return cls(
+            stribeck="stribeck" in parts,
+            load="load" in parts,
+            spring="spring" in parts,
+            couplings=tuple(couplings),
+        )
 
     @property
     def terms(self) -> tuple[str, ...]:

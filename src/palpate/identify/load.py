@@ -11,7 +11,7 @@ from palpate.errors import InputError, LogError
 from palpate.identify.consistent import link_parameters
 from palpate.identify.data import prepare
 from palpate.identify.fitting import DRIFTING, Fit, check_joints, friction_size
-from palpate.identify.regress import HUBER, Builder, Problem
+from palpate.identify.regress import HUBER, Builder, IndexArray, Problem
 from palpate.logs import Log
 
 GYRATION = 0.1
@@ -46,16 +46,14 @@ class LoadEstimate:
     rows: int
 
 
-def estimate_load(
-    fit: Fit, log: Log, *, parameters: int = 10, drift: float | None = None
-) -> LoadEstimate:
+def estimate_load(fit: Fit, log: Log, *, parameters: int = 10, drift: float | None = None) -> LoadEstimate:
     """Weigh what the arm carries in a log.
 
     The torque the free model leaves is fitted by the load's parameters, robustly, and by changes of friction of
-    the size it had between the free logs. The inertia is expected near that of a body of 0.1 m radius of gyration. The error of
-    the free model enters with the size and the memory it had on data held out, and the drives' scale with the
-    doubt the arm states, or else with what it differed by between the free logs (see :attr:`Fit.scale_std`):
-    that, and not the number of rows, makes the interval.
+    the size it had between the free logs. The inertia is expected near that of a body of 0.1 m radius of gyration.
+    The error of the free model enters with the size and the memory it had on data held out, and the drives' scale
+    with the doubt the arm states, or else with what it differed by between the free logs (see
+    :attr:`Fit.scale_std`): that, and not the number of rows, makes the interval.
 
     Args:
         fit: from free motion.
@@ -93,7 +91,9 @@ class LoadProblem:
         phi[10 * (n - 1) : 10 * n] += load
         return self.builder.problem(self.fit.friction, self.fit.shape, phi)
 
-    def solve(self, rows: slice | Array, parameters: int = 10, drift: float | None = None) -> LoadEstimate:
+    def solve(
+        self, rows: slice | IndexArray, parameters: int = 10, drift: float | None = None
+    ) -> LoadEstimate:
         """See :func:`estimate_load`; ``rows`` picks a window of the regression rows.
 
         Raises:
@@ -125,14 +125,18 @@ class LoadProblem:
         )
 
     def _step(
-        self, problem: Problem, rows: slice | Array, before: Array, last: Array, parameters: int, drift: Array
+        self,
+        problem: Problem,
+        rows: slice | IndexArray,
+        before: Array,
+        last: Array,
+        parameters: int,
+        drift: Array,
     ) -> tuple[Array, Array, Array]:
         """One robust Gauss step: estimate (10,), covariance (10, 10), residual (M, n)."""
         fit = self.fit
         n = self.builder.arm.n
-        terms = [
-            (k, p) for k, p in enumerate(problem.parameters) if p.kind in DRIFTING
-        ]
+        terms = [(k, p) for k, p in enumerate(problem.parameters) if p.kind in DRIFTING]
         place = {k: 10 + i for i, (k, _) in enumerate(terms)}
         size = 10 + len(terms)
         scaled = np.zeros((size, n))

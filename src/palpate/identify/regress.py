@@ -250,7 +250,9 @@ class Builder:
         for j in range(n):
             at, A = problem.blocks[j]
             own = [k for k, i in enumerate(at) if problem.parameters[i].kind in _FRICTION_UNITS]
-            kept = [k for k in own if problem.parameters[at[k]].kind in ("viscous", "offset", "load", "stiffness")]
+            kept = [
+                k for k in own if problem.parameters[at[k]].kind in ("viscous", "offset", "load", "stiffness")
+            ]
             root = np.sqrt(solution.weights[:, j])
             rest = (problem.y[:, j] - A @ solution.phi[at] + A[:, own] @ solution.phi[at[own]]) * root
             fixed = A[:, kept] * root[:, None]

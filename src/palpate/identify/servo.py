@@ -28,6 +28,8 @@ from palpate.logs import Log
 
 PRESLIDING = 3e-3
 """x_0 of small gear trains [rad]"""
+MOVING = 0.9
+"""share of motion (1 less how much of it is rest) that one row of a log must have for the log to show motion"""
 START = (30.0, 2e-3, 0.05, 5e-3)
 """where the search starts: W/(N m)^2, kg m^2, N m, N m s/rad; small geared servos are within a decade"""
 
@@ -71,7 +73,6 @@ class BusDrive:
         parts = _columns(self, data, volts)
         return parts @ np.array([1.0, -self.rotor_inertia, -self.viscous, -self.coulomb]), data
 
-
     def weigh(self, arm: Arm, log: Log, *, voltage: str = "voltage") -> float:
         """Mass [kg] that hangs on the servo in a log, by least squares over the rows in motion.
 
@@ -86,8 +87,9 @@ class BusDrive:
         _check(arm)
         torque, data = self.load_torque(log, voltage=voltage)
         expected = data.reduce(lambda s: arm.inverse_dynamics(s.q, s.dq, s.ddq))[:, 0]
-        weighted = (1.0 - _rest(data)) * expected
-        if not np.any(weighted):
+        moving = 1.0 - _rest(data)
+        weighted = moving * expected
+        if moving.max() < MOVING or not np.any(weighted):
             raise LogError("the servo does not move: at rest its friction is anywhere within +-F_c")
         return float(arm.joints[0].mass * (weighted @ torque) / (weighted @ expected))
 

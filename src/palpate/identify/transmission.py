@@ -126,9 +126,7 @@ def fit_transmission(
     )
 
 
-def _bounded(
-    problem: Problem, solution: Solution, groups: Sequence[tuple[int, ...]]
-) -> tuple[Array, Array]:
+def _bounded(problem: Problem, solution: Solution, groups: Sequence[tuple[int, ...]]) -> tuple[Array, Array]:
     """Weighted least squares with rotor inertia and frictions >= 0; values and standard deviations.
 
     A ridge of 1 % of each column keeps apart what one-way motion cannot (Coulomb friction and offset share the
@@ -161,7 +159,9 @@ def _bounded(
     stacked = np.vstack([B, np.diag(ridge)]) / scale
     low = [0.0 if kind in POSITIVE else -np.inf for kind in kinds]
     found, std = np.zeros(count), np.zeros(count)
-    found[used] = lsq_linear(stacked, np.concatenate([*right, np.zeros(len(used))]), bounds=(low, np.inf)).x / scale
+    found[used] = (
+        lsq_linear(stacked, np.concatenate([*right, np.zeros(len(used))]), bounds=(low, np.inf)).x / scale
+    )
     std[used] = np.sqrt(np.diag(np.linalg.inv(stacked.T @ stacked))) / scale
     return found[leader], std[leader]
 
