@@ -22,12 +22,9 @@ from palpate.identify import (
 from palpate.identify.load import LoadProblem
 from palpate.identify.regress import Builder
 from palpate.logs import ColumnMap, Log, read_bam, read_tx40
-from palpate.studies.accuracy import pendulum
+from palpate.studies.accuracy import GAIN, MASS, pendulum
 
 pytest.importorskip("scipy")
-
-GAIN = np.array([11.976, 11.976, 9.839, 10.763, 10.763, 10.763])
-MASS = 2.805
 
 
 def data(*parts: str) -> Path:
