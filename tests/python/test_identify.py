@@ -416,11 +416,13 @@ def test_a_spring_comes_back_and_is_no_part_of_the_card():
     log = simulate(arm, 20.0)
     stiffness = np.array([0.0, 0.0, 4.0, 0.0, 2.0, 0.0, 1.0])
     log = dataclasses.replace(log, effort=log.effort + stiffness * log.position)
-    found = fit(perturbed(arm), log, friction="coulomb+spring", cross_validate=False)
-    springs = [e for e in found.parameters if e.name.endswith(".stiffness")]
-    for e, true in zip(springs, stiffness, strict=True):
-        assert abs(e.value - true) < 3.0 * e.std + 0.01
-    np.testing.assert_allclose([springs[k].value for k in (2, 4, 6)], [4.0, 2.0, 1.0], rtol=0.05)
+    for bad in ((7,), (-1,)):
+        with pytest.raises(InputError, match="springs"):
+            fit(arm, log, friction=FrictionModel(springs=bad))
+    found = fit(perturbed(arm), log, friction=FrictionModel(springs=(6, 2, 4)), cross_validate=False)
+    springs = {e.name.split(".")[0]: e.value for e in found.parameters if e.name.endswith(".stiffness")}
+    assert springs == pytest.approx({arm.joints[k].name: stiffness[k] for k in (2, 4, 6)}, rel=0.05)
+    assert found.base.rank == found.base.structural_rank
     assert "left out" in found.arm.provenance["springs"]
     rigid = fit(perturbed(arm), log, friction="coulomb", cross_validate=False)
     assert found.residuals.overall < 0.5 * rigid.residuals.overall

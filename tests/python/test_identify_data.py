@@ -22,7 +22,7 @@ from palpate.identify import (
 from palpate.identify.load import LoadProblem
 from palpate.identify.regress import Builder
 from palpate.logs import ColumnMap, Log, read_bam, read_tx40
-from palpate.studies.accuracy import GAIN, MASS, pendulum
+from palpate.studies.accuracy import GAIN, MASS, chosen_within, pendulum
 
 pytest.importorskip("scipy")
 
@@ -110,9 +110,12 @@ def test_kuka():
     assert held.relative_overall < 0.02
     # joint 7's sensor shows torque that goes with its angle: possible links cannot follow it, a spring can
     assert fit(arm, logs[0], validate_on=logs[1]).held_out.relative_overall < 0.022
-    sprung = fit(arm, logs[0], friction="stribeck+load+spring", validate_on=logs[1]).held_out
-    assert sprung.relative_overall < 0.02
-    assert sprung.rms[6] < 0.12
+    model, prior, chosen, plain = chosen_within(arm, logs[0])
+    assert model.springs == (6,)
+    assert chosen < plain
+    held = fit(arm, logs[0], friction=model, prior=prior, validate_on=logs[1]).held_out
+    assert held.relative_overall < 0.02
+    assert held.rms[6] < 0.12
 
 
 def test_kinova():

@@ -237,7 +237,7 @@ def fit(
     Args:
         arm: kinematics, gravity, effort gains; its inertias are the prior.
         logs: free motion, one or several logs of the same arm.
-        friction: ``coulomb``, or ``stribeck``, ``load``, ``spring`` joined by ``+``, or a :class:`FrictionModel`.
+        friction: ``coulomb``, ``stribeck``, ``load``, ``stribeck+load`` or a :class:`FrictionModel`.
         couplings: drives that turn with several joints (with ``friction`` as a name).
         method: ``consistent`` (links that can exist), or least squares ``irls``, ``wls``, ``ols``: then
             ``phi`` is the solution nearest to the prior and the arm gets the nearest links that can exist.
@@ -601,7 +601,9 @@ def identified(arm: Arm, problem: Problem, phi: Array, data: RegressionData, gai
         "identified": f"{len(data.origins)} logs, {rows} samples, {data.cutoff:g} Hz",
         "friction": "+".join(problem.model.terms) + ", sign remembered over a presliding distance",
     }
-    if problem.model.spring:
-        stiffness = ", ".join(f"{phi[problem.index('stiffness', i)]:.3g}" for i in range(arm.n))
+    if problem.model.springs:
+        stiffness = ", ".join(
+            f"{arm.joints[j].name} {phi[problem.index('stiffness', j)]:.3g}" for j in problem.model.springs
+        )
         provenance["springs"] = f"fitted and left out here, N m/rad: {stiffness}"
     return arm.replace(joints=tuple(joints), provenance=provenance)

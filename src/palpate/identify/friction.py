@@ -51,8 +51,8 @@ class FrictionModel:
         stribeck: adds (F_s - F_c) exp(-(dq/v_s)^2), v_s searched; F_s < F_c (less friction at low speed, the
             concave curve of many harmonic drives) is allowed.
         load: adds load |tau_load| to F_c.
-        spring: adds k q, k >= 0: a harness or hose that turns with the joint pulls it back. An arm card has no
-            springs: what it says is then k q off.
+        springs: joints, by index, that get k q, k >= 0: a harness or hose that turns with the joint pulls it back.
+            An arm card has no springs: what it says is then k q off.
         rotor_inertia: fits I_a ddq.
         presliding: distances x_0 tried [rad]; one value fixes it.
         velocities: Stribeck velocities v_s tried, as parts of the joint's fastest speed [1].
@@ -61,7 +61,7 @@ class FrictionModel:
 
     stribeck: bool = False
     load: bool = False
-    spring: bool = False
+    springs: tuple[int, ...] = ()
     rotor_inertia: bool = True
     presliding: tuple[float, ...] = PRESLIDING
     velocities: tuple[float, ...] = STRIBECK
@@ -74,25 +74,21 @@ class FrictionModel:
                 raise InputError(f"friction {name} must be positive numbers, got {values}")
             object.__setattr__(self, name, values)
         object.__setattr__(self, "couplings", tuple(self.couplings))
+        object.__setattr__(self, "springs", tuple(sorted({int(j) for j in self.springs})))
+        if self.springs and self.springs[0] < 0:
+            raise InputError(f"springs must be indices of joints, from 0, got {self.springs}")
 
     @classmethod
     def named(cls, name: str, couplings: Sequence[Coupling] = ()) -> FrictionModel:
-        """``"coulomb"``, or ``"stribeck"``, ``"load"``, ``"spring"`` joined by ``+``.
+        """``"coulomb"``, ``"stribeck"``, ``"load"`` or ``"stribeck+load"``.
 
         Raises:
             InputError: another name.
         """
         parts = set(name.split("+")) - {"coulomb"}
-        if not parts <= {"stribeck", "load", "spring"}:
-            raise InputError(
-                f"friction must be coulomb, or stribeck, load, spring joined by +, e.g. stribeck+load; got {name!r}"
-            )
-        return cls(
-            stribeck="stribeck" in parts,
-            load="load" in parts,
-            spring="spring" in parts,
-            couplings=tuple(couplings),
-        )
+        if not parts <= {"stribeck", "load"}:
+            raise InputError(f"friction must be coulomb, stribeck, load or stribeck+load, got {name!r}")
+        return cls(stribeck="stribeck" in parts, load="load" in parts, couplings=tuple(couplings))
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -103,7 +99,6 @@ class FrictionModel:
             "offset",
             *(("stribeck",) if self.stribeck else ()),
             *(("load",) if self.load else ()),
-            *(("stiffness",) if self.spring else ()),
         )
 
 
@@ -171,8 +166,6 @@ def columns(
         if load_torque is None:
             raise InputError("load-dependent friction needs the load torque")
         parts.append(z * np.abs(load_torque))
-    if model.spring:
-        parts.append(segment.q)
     return np.stack(parts, axis=2)
 
 

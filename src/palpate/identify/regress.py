@@ -131,6 +131,12 @@ def parameters(arm: Arm, model: FrictionModel, *, links: bool = True) -> tuple[P
         name = "+".join(arm.joints[j].name for j in coupling.joints)
         for term, unit in (("rotor_inertia", "kg m^2"), ("viscous", "N m s/rad"), ("coulomb", "N m")):
             found.append(Parameter(f"{name}.{term}", unit, "coupling", c))
+    if model.springs and model.springs[-1] >= arm.n:
+        raise InputError(f"springs {model.springs}: the arm has joints 0 to {arm.n - 1}")
+    found += [
+        Parameter(f"{arm.joints[j].name}.stiffness", _FRICTION_UNITS["stiffness"], "stiffness", j)
+        for j in model.springs
+    ]
     return tuple(found)
 
 
@@ -214,6 +220,7 @@ class Builder:
             self.data.reduce(lambda s, c=c: coupling_columns(c, s, shape.presliding[c.joints[0]]))  # type: ignore[misc]
             for c in model.couplings
         ]
+        turned = self.data.reduce(lambda s: s.q) if model.springs else self.data.q
         start = width + (n if model.rotor_inertia else 0)
         terms = len(model.terms)
         blocks = []
@@ -227,6 +234,9 @@ class Builder:
                 if j in coupling.joints:
                     at += range(start + terms * n + 3 * c, start + terms * n + 3 * c + 3)
                     parts.append(part)
+            if j in model.springs:
+                at.append(len(entries) - len(model.springs) + model.springs.index(j))
+                parts.append(turned[:, j])
             blocks.append((np.array(at, dtype=np.intp), np.column_stack(parts)))
         return Problem(entries, tuple(blocks), self.y, self.known, self.rest, self.data, model, shape)
 
