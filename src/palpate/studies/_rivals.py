@@ -323,10 +323,10 @@ def figaroh_tx40(folder: Path) -> Example:
     """
     from scipy import signal
 
-    tools = _imported("figaroh.identification.identification_tools", "figaroh")
-    basic = _imported("figaroh.tools.regressor", "figaroh").build_regressor_basic
     settings = _FIGAROH | {"act_idxv": list(range(6)), "ts": 2e-4, "cut_off_frequency_butterworth": 100.0}
     with _quiet():
+        tools = _imported("figaroh.identification.identification_tools", "figaroh")
+        basic = _imported("figaroh.tools.regressor", "figaroh").build_regressor_basic
         robot = _figaroh_robot(folder / "tx40_mdh_modified.urdf")
         effort, motor = (_csv(folder / f"{name}.csv.gz") for name in ("curr_data", "pos_read_data"))
         begin = time.perf_counter()

@@ -422,7 +422,7 @@ def _kuka() -> list[Row]:
     rows = [
         at_most("KUKA LWR, first run -> second run, physically consistent", 2.0,
                 100.0 * found.held_out.relative_overall, "%",
-                f"harness's spring at joint {joints}, prior weight {prior:g}, both chosen within the first run: thirds of "
+                f"harness's spring at joint {joints}, prior weight {prior:g}, chosen within the first run: thirds of "
                 f"it from one another {chosen:.2f} %, with the defaults {plain:.2f} %")
     ]  # fmt: skip
     for what, method in (("physically consistent", "consistent"), ("weighted least squares", "wls")):
