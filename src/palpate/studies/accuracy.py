@@ -451,10 +451,12 @@ def _time() -> list[Row]:
     fit(arm, log, cross_validate=False)  # what is imported and paged in on the way is no part of it
     times = [fit(arm, log, cross_validate=False).seconds for _ in range(3)]
     best = [min(t[k] for t in times) for k in (0, 1)]
+    threads = next(
+        (os.environ[v] for v in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS") if v in os.environ), "default"
+    )
+    note = f"best of 3; threads of the linear algebra: {threads}; load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
     rows = [
-        at_most(
-            f"time to identify six joints from {log.duration:.0f} s, {what}", limit, seconds, "s", "best of 3"
-        )
+        at_most(f"time to identify six joints from {log.duration:.0f} s, {what}", limit, seconds, "s", note)
         for what, limit, seconds in zip(("least squares", "physically consistent"), limits, best, strict=True)
     ]
     for name in ("pinocchio", "figaroh"):
