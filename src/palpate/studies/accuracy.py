@@ -454,7 +454,7 @@ def _time() -> list[Row]:
     threads = next(
         (os.environ[v] for v in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS") if v in os.environ), "default"
     )
-    note = f"best of 3; threads of the linear algebra: {threads}; load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+    note = f"best of 3; threads of the linear algebra: {threads}; load {os.getloadavg()[0]:.1f}, {os.cpu_count()} cores"
     rows = [
         at_most(f"time to identify six joints from {log.duration:.0f} s, {what}", limit, seconds, "s", note)
         for what, limit, seconds in zip(("least squares", "physically consistent"), limits, best, strict=True)
