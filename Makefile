@@ -123,7 +123,6 @@ wheel: $(VENV)/.test
 
 bench: $(VENV)/.bench
 	$(BIN)/palpate bench speed --out build/bench/results
-	@set -e; for script in benchmarks/*.py; do $(BIN)/python $$script; done
 
 format: $(VENV)/.test
 	$(PIP_INSTALL) "clang-format>=18"

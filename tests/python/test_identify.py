@@ -368,6 +368,67 @@ def test_load_and_false_load(result):
         estimate_load(result, simulate(arm, 10.0), parameters=3)
 
 
+def aged(log: Log, scale: float = 1.0, friction: float = 1.0) -> Log:
+    """The log of a day on which the drives gave `scale` of the torque and friction was `friction` of its size."""
+    arm = truth()
+    more = (friction - 1.0) * arm.friction_torque(log.velocity)
+    return dataclasses.replace(log, effort=(log.effort + more / arm.effort.gain(arm.n)) * scale)
+
+
+def test_days_that_differ_widen_the_interval(result):
+    arm = truth()
+    assert np.all(
+        (result.scale_std > 0.009) & (result.scale_std < 0.012)
+    )  # 2 % for one log, three that agree
+    assert np.all((result.drift_std > 0.04) & (result.drift_std < 0.06))  # 10 % for one log
+    single = fit(perturbed(arm), simulate(arm, 20.0), friction="coulomb", cross_validate=False)
+    np.testing.assert_array_equal(single.scale_std, 0.02)
+    np.testing.assert_array_equal(single.drift_std, 0.1)
+    days = (0.94, 1.06, 1.0)
+    logs = [aged(simulate(arm, 20.0, seed=k), scale=s) for k, s in enumerate(days)]
+    weak = fit(perturbed(arm), logs, friction="coulomb")
+    assert np.all(weak.scale_std > 0.03)
+    logs = [aged(simulate(arm, 20.0, seed=k), friction=s) for k, s in enumerate((0.6, 1.4, 1.0))]
+    warm = fit(perturbed(arm), logs, friction="coulomb")
+    assert np.all(warm.drift_std > 1.5 * result.drift_std)
+    held = link_parameters(1.2, np.array([0.05, -0.03, 0.1]), 0.005 * np.eye(3))
+    log = simulate(arm, 10.0, seed=9, load=held)
+    assert estimate_load(weak, log).mass_std > 1.5 * estimate_load(result, log).mass_std
+    calm = estimate_load(result, log, drift=0.0)
+    assert calm.mass_std < estimate_load(result, log).mass_std
+
+
+def test_gains_say_that_a_drive_may_give_less_under_load():
+    arm = truth()
+    gains = np.array([11.0, 12.0, 10.0, 9.5, 8.0, 7.0, 6.0])
+    driven = arm.replace(effort=Effort.current(gains))
+    held = link_parameters(3.0, np.array([0.1, 0.05, 0.1]), 0.01 * np.eye(3))
+    free = simulate(driven, 20.0, seed=0)
+    loaded = simulate(driven, 20.0, seed=1, load=held)
+    weaker = dataclasses.replace(loaded, effort=0.98 * loaded.effort)
+    found = fit_gains(perturbed(arm), free, weaker, KnownLoad(3.0), friction="coulomb")
+    assert np.abs(found.gain / gains - 1.0).max() > 0.015
+    assert np.all(np.abs(found.gain - gains) < 3.0 * found.std)
+
+
+def test_a_spring_comes_back_and_is_no_part_of_the_card():
+    arm = truth()
+    log = simulate(arm, 20.0)
+    stiffness = np.array([0.0, 0.0, 4.0, 0.0, 2.0, 0.0, 1.0])
+    log = dataclasses.replace(log, effort=log.effort + stiffness * log.position)
+    for bad in ((7,), (-1,)):
+        with pytest.raises(InputError, match="springs"):
+            fit(arm, log, friction=FrictionModel(springs=bad))
+    found = fit(perturbed(arm), log, friction=FrictionModel(springs=(6, 2, 4)), cross_validate=False)
+    springs = {e.name.split(".")[0]: e.value for e in found.parameters if e.name.endswith(".stiffness")}
+    assert springs == pytest.approx({arm.joints[k].name: stiffness[k] for k in (2, 4, 6)}, rel=0.05)
+    assert found.base.rank == found.base.structural_rank
+    assert "left out" in found.arm.provenance["springs"]
+    rigid = fit(perturbed(arm), log, friction="coulomb", cross_validate=False)
+    assert found.residuals.overall < 0.5 * rigid.residuals.overall
+    assert "springs" not in rigid.arm.provenance
+
+
 def test_gains_from_a_known_load():
     arm = truth()
     gains = np.array([11.0, 12.0, 10.0, 9.5, 8.0, 7.0, 6.0])
@@ -405,6 +466,33 @@ def test_transmission_from_a_joint_torque_sensor():
         assert values[f"{j.name}.coulomb"] == pytest.approx(j.friction.coulomb, rel=0.1)
         assert values[f"{j.name}.rotor_inertia"] == pytest.approx(j.rotor_inertia, abs=0.05)
     np.testing.assert_allclose(found.test(log).rms, found.residuals.rms, rtol=1e-6)
+
+
+def test_drives_of_one_make_share_their_rotor_inertia():
+    arm = truth()
+    arm = arm.replace(joints=tuple(j.replace(rotor_inertia=0.2) for j in arm.joints))
+    t, q, dq, ddq = motion(arm.n, 20.0, 0)
+    q[:, 3], dq[:, 3], ddq[:, 3] = 0.1 * t - 1.0, 0.1, 0.0  # this one never accelerates
+    tau = arm.inverse_dynamics(q, dq, ddq)
+    noise = 0.02 * np.random.default_rng(4).standard_normal(tau.shape)
+    time_ns = np.rint(t * 1e9).astype(np.int64)
+    log = Log(
+        time_ns=time_ns,
+        position=q,
+        velocity=dq,
+        effort=tau + arm.friction_torque(dq) + noise,
+        joint_names=arm.joint_names,
+        signals={"sensor": Signal(time_ns, tau - 0.2 * ddq, "N m")},
+        meta={"effort_unit": "N m"},
+    )
+    name = f"{arm.joints[3].name}.rotor_inertia"
+    for alike, wanted in (((), 0.0), (((1, 2, 3, 4), (5, 6)), 0.2)):
+        found = fit_transmission(arm, log, reference="sensor", friction="coulomb", alike=alike)
+        values = {e.name: e.value for e in found.parameters}
+        assert values[name] == pytest.approx(wanted, abs=0.03)
+    for bad in (((0, 1), (1, 2)), ((0, 7),)):
+        with pytest.raises(InputError, match="different joints from 0 to 6"):
+            fit_transmission(arm, log, reference="sensor", alike=bad)
 
 
 def test_couplings():
@@ -524,3 +612,25 @@ def test_servo_with_the_current_of_its_supply():
     off = Signal(log.time_ns, np.zeros(len(log)), "1")
     with pytest.raises(LogError, match="off"):
         fit_bus_drive(arm, dataclasses.replace(log, signals={**log.signals, "enabled": off}))
+
+
+def test_a_servo_that_is_held_by_its_friction_is_not_weighed():
+    arm, log = servo_log(20.0, 0)
+    drive = fit_bus_drive(arm, log)
+    step = 2.0 * np.pi / 4096
+    count = len(log) // 2
+    rng = np.random.default_rng(0)
+    # it stops, its encoder flickers, and the drive gives half as much again as the load asks for
+    q = np.concatenate([log.position[:count], log.position[count] + step * rng.integers(0, 2, (count, 1))])
+    bus = log.effort[: 2 * count].copy()
+    still = arm.gravity_torque(log.position[count])[0]
+    bus[count:, 0] = np.sign(still) * 30.0 * (1.5 * still) ** 2 / 7.4
+    counted = dataclasses.replace(
+        log[: 2 * count], position=step * np.round(q / step), effort=bus, velocity=None
+    )
+    assert prepare(counted).resolution[0] == pytest.approx(step, rel=1e-6)
+    assert drive.weigh(arm, counted) == pytest.approx(0.5, rel=0.05)
+    with pytest.raises(LogError, match="does not move"):
+        drive.weigh(arm, counted[count + 100 :])
+    with pytest.raises(InputError, match="one joint"):
+        drive.weigh(truth(), log)

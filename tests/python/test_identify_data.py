@@ -9,13 +9,22 @@ import numpy as np
 import pytest
 
 from palpate import Arm, Effort
-from palpate.identify import Coupling, KnownLoad, estimate_load, fit, fit_gains, fit_transmission
-from palpate.logs import ColumnMap, Log, read_tx40
+from palpate.identify import (
+    Coupling,
+    KnownLoad,
+    estimate_load,
+    fit,
+    fit_bus_drive,
+    fit_gains,
+    fit_transmission,
+    prepare,
+)
+from palpate.identify.load import LoadProblem
+from palpate.identify.regress import Builder
+from palpate.logs import ColumnMap, Log, read_bam, read_tx40
+from palpate.studies.accuracy import GAIN, MASS, chosen_within, pendulum
 
 pytest.importorskip("scipy")
-
-GAIN = np.array([11.976, 11.976, 9.839, 10.763, 10.763, 10.763])
-MASS = 2.805
 
 
 def data(*parts: str) -> Path:
@@ -99,8 +108,14 @@ def test_kuka():
     logs = [Log.open(folder / f"measurements_{k}.npz", ColumnMap.named("kuka_lwr4")) for k in (1, 2)]
     held = fit(arm, logs[0], friction="coulomb", method="irls", validate_on=logs[1]).held_out
     assert held.relative_overall < 0.02
-    # joint 7's sensor shows torque that no link could cause; possible links cannot follow it
+    # joint 7's sensor shows torque that goes with its angle: possible links cannot follow it, a spring can
     assert fit(arm, logs[0], validate_on=logs[1]).held_out.relative_overall < 0.022
+    model, prior, chosen, plain = chosen_within(arm, logs[0])
+    assert model.springs == (6,)
+    assert chosen < plain
+    held = fit(arm, logs[0], friction=model, prior=prior, validate_on=logs[1]).held_out
+    assert held.relative_overall < 0.02
+    assert held.rms[6] < 0.12
 
 
 def test_kinova():
@@ -119,3 +134,30 @@ def test_kinova():
     assert rms[6] < 0.5
     assert rms[2] < 0.8
     assert rms[3] < 0.9
+    alike = fit_transmission(
+        arm, first, reference="torque_sensor", friction="coulomb", alike=((0, 1, 2, 3), (4, 5, 6))
+    )
+    assert np.all(alike.test(second).rms[[3, 5, 6]] < [0.55, 0.5, 0.3])
+
+
+def test_xl330():
+    logs = [read_bam(path) for path in sorted(data("xl330_bam").glob("*.json"))]
+    assert len(logs) == 7
+    for k in (2, 4):  # the ones that stand long and that move most
+        drive = fit_bus_drive(pendulum(0.49), logs[:k] + logs[k + 1 :])
+        assert drive.weigh(pendulum(1.0), logs[k]) == pytest.approx(0.49, rel=0.15)
+
+
+def test_ur10e_load_in_short_windows(ur10e):
+    _, _, found = ur10e
+    assert np.all(found.drift_std < 0.07)  # friction of four days differs by less than was assumed
+    errors, held = [], []
+    for name in ("ur-20_01_31-load", "ur-20_02_19_14harm50secLoad"):
+        prepared = prepare(ur10e_log(f"identification_data/{name}"), cutoff=found.cutoff)
+        problem = LoadProblem(found, Builder(found.start, prepared, prepared.effort * GAIN))
+        for start in np.arange(4.0, prepared.time[-1] - 8.0, 2.0):
+            e = problem.solve(np.flatnonzero((prepared.time >= start) & (prepared.time < start + 8.0)))
+            errors.append(e.mass / MASS - 1.0)
+            held.append(e.interval[0] < MASS < e.interval[1])
+    assert np.abs(errors).max() < 0.04
+    assert 0.85 <= np.mean(held) <= 1.0

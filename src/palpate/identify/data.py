@@ -82,6 +82,7 @@ class RegressionData:
         log: (M,) number of the row's log.
         weight: (M,) weight of each row's squared residual [1], from the logs' weights.
         noise: (n,) standard deviation of what the filters took out of the effort, driver's unit.
+        resolution: (n,) smallest step of the position readings [rad]; 0 where they look continuous.
         cutoff: of the parallel filter [Hz].
         rate: rows per second [Hz].
         effort_unit: as the first log declares it; empty if it does not.
@@ -98,6 +99,7 @@ class RegressionData:
     log: Any
     weight: Array
     noise: Array
+    resolution: Array
     cutoff: float
     rate: float
     effort_unit: str = ""
@@ -231,10 +233,23 @@ def prepare(
         log=number,
         weight=np.asarray(factors)[number],
         noise=np.sqrt(np.mean(np.square(noise), axis=0)),
+        resolution=np.array(
+            [_resolution(np.concatenate([log.position[:, j] for log in logs])) for j in range(len(names))]
+        ),
         cutoff=cutoff,
         rate=segments[0].rate / (parts[0].step or 1),
         effort_unit=logs[0].meta.get("effort_unit", ""),
     )
+
+
+def _resolution(position: Array) -> float:
+    """Smallest step between different readings [rad]; 0 if they look continuous."""
+    values = np.unique(position[np.isfinite(position)])
+    if len(values) < 2:
+        return 0.0
+    step = float(np.min(np.diff(values)))
+    # a count repeats: readings on a grid have far fewer values than samples
+    return step if len(values) < 0.5 * len(position) or step > 1e-7 else 0.0
 
 
 def motion_band(log: Log) -> float:

@@ -47,7 +47,15 @@ LOAD_FRICTION_STD = 0.1
 """prior of the load-dependent friction coefficient [1]: gears that lose more of what they carry are rare"""
 ROUNDS = 3
 """rounds of friction shape, load torque and least squares; the third changes nothing that shows"""
-POSITIVE = ("rotor", "coulomb", "viscous", "load")
+FRICTION_DRIFT = 0.1
+"""standard deviation of friction from log to log, as a part of its value [1], before any was compared (temperature,
+wear, grease). Worth one log."""
+GAIN_STD = 0.02
+"""standard deviation of a drive's torque scale from log to log [1] before any was compared: magnets lose 0.1 to
+0.2 % per kelvin, and friction in the gear is not the same under load. Worth one log."""
+DRIFTING = ("coulomb", "viscous", "offset")
+"""friction that differs from log to log"""
+POSITIVE = ("rotor", "coulomb", "viscous", "load", "stiffness")
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +149,10 @@ class Fit:
         error_std: (n,) standard deviation of the prediction's error on data the fit has not seen, in motion
             [N m]; where nothing was held out, of the fit's own residual.
         error_inflation: (n,) rows per independent one of that error [1].
+        scale_std: (n,) standard deviation of the drives' torque scale from log to log [1]: from each log's measured
+            against its predicted torque where logs were held out, with 2 % for one log more; else 2 %.
+        drift_std: (n,) standard deviation of friction from log to log, as a part of its value [1]: likewise, with
+            10 % for one log more; else 10 %.
         seconds: time the fit took, least squares alone and in all [s].
     """
 
@@ -160,6 +172,8 @@ class Fit:
     inflation: Array
     error_std: Array
     error_inflation: Array
+    scale_std: Array
+    drift_std: Array
     cutoff: float
     method: Method
     seconds: tuple[float, float]
@@ -323,16 +337,16 @@ def fit(
     seen = (problem.known[:, problem.known.any(axis=0)] > 0.0).all(axis=1)
     residuals = Residuals.of(problem.y[seen], predicted[seen], "the fit's own data")
     took = time.perf_counter() - begin
-    held, spread = None, _spread(problem, problem.y - predicted)
+    held, doubt = None, _doubt(problem, predicted, phi)
     if validate_on is not None:
         others = (validate_on,) if isinstance(validate_on, Log) else tuple(validate_on)
         unseen = _problem_of(arm, others, problem, phi, data.cutoff, effort, gain, drives)
-        held, spread = _held_out(unseen, unseen.predict(phi), "logs the fit has not seen")
+        held, doubt = _held_out(unseen, unseen.predict(phi), "logs the fit has not seen", phi)
     elif cross_validate:
-        held, spread = _held_out(*_cross_validate(builder, problem, method, prior))
+        held, doubt = _held_out(*_cross_validate(builder, problem, method, prior), phi)
     gaps = not_shown(arm, problem, base)
     return Fit(
-        arm=_keep(arm, identified(arm, problem, links, data, gain, every), gaps.joints),
+        arm=_keep(arm, identified(arm, problem, links, data, gain), gaps.joints),
         parameters=_table(arm, problem, phi, covariance, share),
         base=base,
         residuals=residuals,
@@ -346,8 +360,10 @@ def fit(
         covariance=covariance,
         sigma=solution.sigma,
         inflation=solution.inflation,
-        error_std=spread[0],
-        error_inflation=spread[1],
+        error_std=doubt.error_std,
+        error_inflation=doubt.error_inflation,
+        scale_std=doubt.scale_std,
+        drift_std=doubt.drift_std,
         cutoff=data.cutoff,
         method=method,
         seconds=(least, took),
@@ -537,19 +553,59 @@ def _problem_of(
     return builder.problem(problem.model, problem.shape, phi)
 
 
-def _held_out(problem: Problem, predicted: Array, what: str) -> tuple[Residuals, tuple[Array, Array]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Doubt:
+    """How far a prediction may be off; see the attributes of :class:`Fit`."""
+
+    error_std: Array
+    error_inflation: Array
+    scale_std: Array
+    drift_std: Array
+
+
+def _held_out(problem: Problem, predicted: Array, what: str, phi: Array) -> tuple[Residuals, _Doubt]:
     # a joint that never moves has no known friction; the others still count
     seen = (problem.known[:, problem.known.any(axis=0)] > 0.0).all(axis=1)
     if not seen.any():
         raise LogError(f"{what}: no joint moves, so friction is unknown throughout")
-    return Residuals.of(problem.y[seen], predicted[seen], what), _spread(problem, problem.y - predicted)
+    return Residuals.of(problem.y[seen], predicted[seen], what), _doubt(problem, predicted, phi, held=True)
 
 
-def _spread(problem: Problem, error: Array) -> tuple[Array, Array]:
-    """Standard deviation of the error in motion (n,) and rows per independent one (n,)."""
+def _doubt(problem: Problem, predicted: Array, phi: Array, *, held: bool = False) -> _Doubt:
+    """From the error in motion; scale and friction are compared where several logs were held out."""
+    error = problem.y - predicted
     moving = problem.known * (problem.rest < 0.1)
     rows = np.maximum(1.0, moving.sum(axis=0))
-    return np.sqrt(np.sum(np.square(error) * moving, axis=0) / rows), inflation(problem, error * moving)
+    std = np.sqrt(np.sum(np.square(error) * moving, axis=0) / rows)
+    memory = inflation(problem, error * moving)
+    n = problem.y.shape[1]
+    scale, drift = np.full(n, GAIN_STD**2), np.full(n, FRICTION_DRIFT**2)
+    logs = np.unique(problem.data.log)
+    compared = len(logs) if held and len(logs) > 1 else 0  # parts of one log share its temperature
+    for log in logs[:compared]:
+        for j in range(n):
+            weight = moving[:, j] * (problem.data.log == log)
+            size = float(weight @ np.square(predicted[:, j]))
+            off = float(weight @ (predicted[:, j] * error[:, j])) / size if size > 0.0 else GAIN_STD
+            scale[j] += off**2
+            drift[j] += _change(problem, j, phi, error[:, j], weight / max(std[j] ** 2 * memory[j], 1e-300))
+    return _Doubt(std, memory, np.sqrt(scale / (1 + compared)), np.sqrt(drift / (1 + compared)))
+
+
+def _change(problem: Problem, joint: int, phi: Array, error: Array, weight: Array) -> float:
+    """Mean square of a joint's change of friction in some rows, as a part of its value: estimate and its variance."""
+    at, A = problem.blocks[joint]
+    own = [k for k, i in enumerate(at) if problem.parameters[i].kind in DRIFTING]
+    X = A[:, own] * [friction_size(problem, phi, int(at[k])) for k in own]
+    inverse = np.linalg.inv((X * weight[:, None]).T @ X + np.eye(len(own)) / FRICTION_DRIFT**2)
+    found = inverse @ (X.T @ (weight * error))
+    return float(np.mean(np.square(found) + np.diag(inverse)))
+
+
+def friction_size(problem: Problem, phi: Array, index: int) -> float:
+    """What the changes of a friction parameter are measured by: its value, an offset's by the Coulomb friction."""
+    p = problem.parameters[index]
+    return float(abs(phi[problem.index("coulomb", p.index) if p.kind == "offset" else index]))
 
 
 # -- results ----------------------------------------------------------------------------------------------------------
@@ -577,9 +633,7 @@ def _keep(arm: Arm, found: Arm, blind: Sequence[int]) -> Arm:
     return found.replace(joints=tuple(joints))
 
 
-def identified(
-    arm: Arm, problem: Problem, phi: Array, data: RegressionData, gain: Array, logs: Sequence[Log]
-) -> Arm:
+def identified(arm: Arm, problem: Problem, phi: Array, data: RegressionData, gain: Array) -> Arm:
     """The arm with the links, friction, rotor inertias and noise found."""
     joints = []
     for i, joint in enumerate(arm.joints):
@@ -597,7 +651,6 @@ def identified(
             velocity = problem.shape.stribeck_velocity[i]
         # which speeds count as motion, as narrow as the filter allows; the sign itself is remembered
         sign = float(np.clip(problem.shape.presliding[i] * data.cutoff, 1e-3, 1e-2))
-        resolution = _resolution(np.concatenate([log.position[:, i] for log in logs]))
         joints.append(
             joint.replace(
                 mass=mass,
@@ -618,7 +671,7 @@ def identified(
                 ),
                 sensing=replace(
                     joint.sensing,
-                    position_resolution=resolution,
+                    position_resolution=float(data.resolution[i]),
                     torque_std=float(abs(gain[i]) * data.noise[i]),
                 ),
             )
@@ -628,14 +681,9 @@ def identified(
         "identified": f"{len(data.origins)} logs, {rows} samples, {data.cutoff:g} Hz",
         "friction": "+".join(problem.model.terms) + ", sign remembered over a presliding distance",
     }
+    if problem.model.springs:
+        stiffness = ", ".join(
+            f"{arm.joints[j].name} {phi[problem.index('stiffness', j)]:.3g}" for j in problem.model.springs
+        )
+        provenance["springs"] = f"fitted and left out here, N m/rad: {stiffness}"
     return arm.replace(joints=tuple(joints), provenance=provenance)
-
-
-def _resolution(position: Array) -> float:
-    """Smallest step between different readings [rad]; 0 if they look continuous."""
-    values = np.unique(position)
-    if len(values) < 3:
-        return 0.0
-    step = float(np.min(np.diff(values)))
-    # a count repeats: readings on a grid have far fewer values than samples
-    return step if len(values) < 0.5 * len(position) or step > 1e-7 else 0.0

@@ -51,6 +51,8 @@ class FrictionModel:
         stribeck: adds (F_s - F_c) exp(-(dq/v_s)^2), v_s searched; F_s < F_c (less friction at low speed, the
             concave curve of many harmonic drives) is allowed.
         load: adds load |tau_load| to F_c.
+        springs: joints, by index, that get k q, k >= 0: a harness or hose that turns with the joint pulls it back.
+            An arm card has no springs: what it says is then k q off.
         rotor_inertia: fits I_a ddq.
         presliding: distances x_0 tried [rad]; one value fixes it.
         velocities: Stribeck velocities v_s tried, as parts of the joint's fastest speed [1].
@@ -65,6 +67,7 @@ class FrictionModel:
 
     stribeck: bool = False
     load: bool = False
+    springs: tuple[int, ...] = ()
     rotor_inertia: bool = True
     presliding: tuple[float, ...] = PRESLIDING
     velocities: tuple[float, ...] = STRIBECK
@@ -81,6 +84,9 @@ class FrictionModel:
                 raise InputError(f"friction {name} must be positive numbers, got {values}")
             object.__setattr__(self, name, values)
         object.__setattr__(self, "couplings", tuple(self.couplings))
+        object.__setattr__(self, "springs", tuple(sorted({int(j) for j in self.springs})))
+        if self.springs and self.springs[0] < 0:
+            raise InputError(f"springs must be indices of joints, from 0, got {self.springs}")
 
     @classmethod
     def named(cls, name: str, couplings: Sequence[Coupling] = ()) -> FrictionModel:

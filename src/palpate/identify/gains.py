@@ -8,6 +8,10 @@ Regressing the load's torque on the effort, K i = ..., therefore shrinks K. Here
 with the link parameters phi shared by all joints: a joint that hardly feels the load (a vertical first axis) gets
 its gain through the links it has in common with joints that do. Of the load the mass is known, the rest of
 pi_load may be free. Gauss-Newton on (phi, pi_load, 1/K); every step needs the joints' normal matrices only.
+
+Friction is not the same in two logs: its changes are eliminated from the normal matrices beforehand. Rows count by
+the memory of their residual. Neither is a drive's scale the same with the load and without it: that it may differ is
+considered in the standard deviations, not estimated.
 """
 
 from __future__ import annotations
@@ -21,13 +25,24 @@ from palpate.arm import Arm, Array, Effort
 from palpate.errors import InputError
 from palpate.identify.consistent import link_parameters, prior_links
 from palpate.identify.data import prepare
-from palpate.identify.fitting import LOAD_FRICTION_STD, check_joints, check_motion
+from palpate.identify.fitting import (
+    DRIFTING,
+    FRICTION_DRIFT,
+    GAIN_STD,
+    LOAD_FRICTION_STD,
+    check_joints,
+    check_motion,
+    friction_size,
+)
 from palpate.identify.friction import FrictionModel, FrictionShape
+from palpate.identify.load import GYRATION
 from palpate.identify.regress import HUBER, Builder, Problem, fastest, inflation, least_squares
 from palpate.logs import Log
 from palpate.logs.repair import BoolArray
 
 STEPS = 200
+REWEIGHTED = 6
+"""rounds of robust weights"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +90,9 @@ class GainFit:
     """What :func:`fit_gains` found.
 
     Attributes:
-        gain: (n,) K [N m per unit of effort]; std: (n,).
+        gain: (n,) K [N m per unit of effort]; std: (n,), from as many independent rows as the residual has
+            and the doubt whether the drives' scales are the same with the load and without it. A model that is wrong
+            alike in all logs is not in it.
         arm: the arm with these gains as its effort.
         load: (10,) the load's parameters in the last link's frame [kg, kg m, kg m^2].
         iterations: Gauss-Newton steps.
@@ -252,7 +269,7 @@ def _solve(
         phi[p:] = before.load
     inverse = 1.0 / gain
     free = np.r_[np.arange(p), p + np.flatnonzero(~known)]
-    penalty = np.zeros(full)
+    penalty, centre = np.zeros(full), np.zeros(full)
     for k, q in enumerate(problem.parameters):
         if q.kind == "load":
             penalty[k] = 1.0 / LOAD_FRICTION_STD**2
@@ -261,9 +278,19 @@ def _solve(
     iterations = 0
     covariance = np.zeros((n, n))
     residual = y
-    for _ in range(6):  # robust weights
-        H = [(B * weights[:, j : j + 1]).T @ B for j, (_, B) in enumerate(wide)]
-        c = [(B * weights[:, j : j + 1]).T @ y[:, j] for j, (_, B) in enumerate(wide)]
+    memory = np.ones(n)
+    doubt = np.array([j.sensing.torque_gain_std or GAIN_STD for j in arm.joints])
+    for _ in range(REWEIGHTED):
+        normals = [
+            _normal(problem, wide, j, weights[:, j] / memory[j], phi, inverse[j], carries) for j in range(n)
+        ]
+        H, c = [parts[0] for parts in normals], [parts[1] for parts in normals]
+        if not known[4:].any():
+            # a load is no point and no dumb-bell: its inertia stays near that of a body of the usual size
+            spread = phi[p] * GYRATION**2
+            com = phi[p + 1 : p + 4] / phi[p]
+            centre[p + 4 :] = link_parameters(phi[p], com, (2.0 / 3.0) * spread * np.eye(3))[4:]
+            penalty[p + 4 :] = 1.0 / spread**2
         for _ in range(STEPS):
             iterations += 1
             J = np.zeros((full + n, full + n))
@@ -278,7 +305,7 @@ def _solve(
                 g[at] += lam * (c[j] - lam * t)
                 g[full + j] += phi[at] @ (c[j] - lam * t)
             J[np.arange(full), np.arange(full)] += penalty
-            g[:full] -= penalty * phi
+            g[:full] += penalty * (centre - phi)
             use = np.r_[free, np.arange(full, full + n)]
             S = J[np.ix_(use, use)]
             d = np.sqrt(np.maximum(np.diag(S), 1e-300))
@@ -292,7 +319,12 @@ def _solve(
             if float(np.abs(change).max()) < 1e-7:
                 break
         inverse_S = ((vectors[:, seen] / values[seen]) @ vectors[:, seen].T) / np.outer(d, d)
-        covariance = inverse_S[len(free) :, len(free) :]
+        through = np.zeros((full + n, n))
+        for j, (at, _) in enumerate(wide):
+            scaled = normals[j][2]
+            through[at, j], through[full + j, j] = inverse[j] * scaled, phi[at] @ scaled
+        shift = inverse_S @ (through[use] * doubt)
+        covariance = (inverse_S + shift @ shift.T)[len(free) :, len(free) :]
         predicted = np.column_stack([B @ phi[at] * inverse[j] for j, (at, B) in enumerate(wide)])
         residual = y - predicted
         moving = (problem.known > 0.0) & (problem.rest < 0.1)
@@ -306,8 +338,44 @@ def _solve(
         level = np.array([abs(phi[problem.index("coulomb", j)]) for j in range(n)]) * inverse
         variance = np.square(sigma) + problem.rest * np.square(level) / 3.0
         weights = rows / variance / np.maximum(1.0, np.abs(residual) / (HUBER * np.sqrt(variance)))
+        memory = inflation(problem, residual * np.sqrt(weights))
     gain = 1.0 / inverse
-    grow = inflation(problem, residual * np.sqrt(weights))
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0) * grow) * np.square(gain)
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0)) * np.square(gain)
     rms = np.sqrt(np.mean(np.square(residual), axis=0)) * gain
     return _State(phi[:p].copy(), phi[p:].copy(), gain, std, rms, iterations, names)
+
+
+def _normal(
+    problem: Problem,
+    wide: list[tuple[Array, Array]],
+    joint: int,
+    weights: Array,
+    phi: Array,
+    inverse: float,
+    carries: BoolArray,
+) -> tuple[Array, Array, Array]:
+    """A joint's normal matrix, right-hand side, and the same for the torque of the loaded logs in the effort's place.
+
+    The changes of its friction from log to log are eliminated.
+
+    With D the columns of those changes, one set per log, and P their prior: W - W D (D^T W D + P)^-1 D^T W in the
+    place of W.
+    """
+    at, B = wide[joint]
+    y = problem.y[:, joint]
+    columns, precision = [], []
+    for k, i in enumerate(at[:-10]):
+        if problem.parameters[i].kind not in DRIFTING:
+            continue
+        size = FRICTION_DRIFT * friction_size(problem, phi, int(i)) * abs(inverse)
+        for log in np.unique(problem.data.log):
+            columns.append(B[:, k] * (problem.data.log == log))
+            precision.append(1.0 / max(size, 1e-9) ** 2)
+    D = np.column_stack(columns)
+    weighted, changed = B * weights[:, None], D * weights[:, None]
+    loaded = (B @ phi[at]) * carries * inverse
+    both = np.column_stack([B, y, loaded])
+    between = np.linalg.solve(changed.T @ D + np.diag(precision), changed.T @ both)
+    cross = weighted.T @ D
+    found: Array = weighted.T @ both - cross @ between
+    return found[:, :-2], found[:, -2], found[:, -1]

@@ -10,15 +10,10 @@ from palpate.arm import Array
 from palpate.errors import InputError, LogError
 from palpate.identify.consistent import link_parameters
 from palpate.identify.data import prepare
-from palpate.identify.fitting import Fit, check_joints
-from palpate.identify.regress import HUBER, Builder, Problem
+from palpate.identify.fitting import DRIFTING, Fit, check_joints, friction_size
+from palpate.identify.regress import HUBER, Builder, IndexArray, Problem
 from palpate.logs import Log
 
-FRICTION_DRIFT = 0.1
-"""part of its value by which friction may differ from the free logs' (temperature), one standard deviation"""
-GAIN_STD = 0.02
-"""standard deviation of a drive's torque scale between the free logs and the load [1], where the arm states
-none: magnets lose 0.1 to 0.2 % per kelvin and friction in the gear is not the same under load"""
 GYRATION = 0.1
 """radius of gyration of a load [m] that its inertia is expected to stay near"""
 MASS_RANGE, MOMENT_RANGE = 50.0, 25.0
@@ -51,19 +46,20 @@ class LoadEstimate:
     rows: int
 
 
-def estimate_load(fit: Fit, log: Log, *, parameters: int = 10, drift: float = FRICTION_DRIFT) -> LoadEstimate:
+def estimate_load(fit: Fit, log: Log, *, parameters: int = 10, drift: float | None = None) -> LoadEstimate:
     """Weigh what the arm carries in a log.
 
     The torque the free model leaves is fitted by the load's parameters, robustly, and by changes of friction of
-    ``drift`` of its size. The inertia is expected near that of a body of 0.1 m radius of gyration. The error of
-    the free model enters with the size and the memory it had on data held out, and the drives' scale with the
-    doubt the arm states (2 % where it states none): that, and not the number of rows, makes the interval.
+    the size it had between the free logs. The inertia is expected near that of a body of 0.1 m radius of gyration.
+    The error of the free model enters with the size and the memory it had on data held out, and the drives' scale
+    with the doubt the arm states, or else with what it differed by between the free logs (see
+    :attr:`Fit.scale_std`): that, and not the number of rows, makes the interval.
 
     Args:
         fit: from free motion.
         log: motion with a load fixed to the last link, or without one (then the mass is about 0).
         parameters: 10; 4: mass and first moment, the inertia being a point's; 1: mass at the grasp point.
-        drift: by which part friction may have changed, one standard deviation [1].
+        drift: by which part friction may have changed, one standard deviation [1]; None: :attr:`Fit.drift_std`.
 
     Raises:
         InputError: another number of parameters; a log of another arm.
@@ -71,7 +67,7 @@ def estimate_load(fit: Fit, log: Log, *, parameters: int = 10, drift: float = FR
     """
     if parameters not in (10, 4, 1):
         raise InputError(f"a load has 10, 4 or 1 parameters, got {parameters!r}")
-    if not (np.isfinite(drift) and drift >= 0.0):
+    if drift is not None and not (np.isfinite(drift) and drift >= 0.0):
         raise InputError(f"drift must be >= 0, got {drift!r}")
     arm = fit.arm
     check_joints(arm, (log,))
@@ -95,7 +91,9 @@ class LoadProblem:
         phi[10 * (n - 1) : 10 * n] += load
         return self.builder.problem(self.fit.friction, self.fit.shape, phi)
 
-    def solve(self, rows: slice | Array, parameters: int = 10, drift: float = FRICTION_DRIFT) -> LoadEstimate:
+    def solve(
+        self, rows: slice | IndexArray, parameters: int = 10, drift: float | None = None
+    ) -> LoadEstimate:
         """See :func:`estimate_load`; ``rows`` picks a window of the regression rows.
 
         Raises:
@@ -105,12 +103,13 @@ class LoadProblem:
         used = self.problem.known[rows]
         if not used.any():
             raise LogError("no joint moves before or in this stretch: its friction is unknown")
+        drifts = fit.drift_std if drift is None else np.full(self.builder.arm.n, drift)
         estimate, covariance = np.zeros(10), np.diag([MASS_RANGE**2, *[MOMENT_RANGE**2] * 3, *[1.0] * 6])
         residual = problem.y[rows]
         for round_ in range(ROUNDS):
             if fit.friction.load and round_ in (1, 3):
                 problem = self._with(estimate)
-            estimate, covariance, residual = self._step(problem, rows, estimate, residual, parameters, drift)
+            estimate, covariance, residual = self._step(problem, rows, estimate, residual, parameters, drifts)
         mass, std = float(estimate[0]), float(np.sqrt(covariance[0, 0]))
         first = estimate[1:4].copy()
         return LoadEstimate(
@@ -126,14 +125,18 @@ class LoadProblem:
         )
 
     def _step(
-        self, problem: Problem, rows: slice | Array, before: Array, last: Array, parameters: int, drift: float
+        self,
+        problem: Problem,
+        rows: slice | IndexArray,
+        before: Array,
+        last: Array,
+        parameters: int,
+        drift: Array,
     ) -> tuple[Array, Array, Array]:
         """One robust Gauss step: estimate (10,), covariance (10, 10), residual (M, n)."""
         fit = self.fit
         n = self.builder.arm.n
-        terms = [
-            (k, p) for k, p in enumerate(problem.parameters) if p.kind in ("coulomb", "viscous", "offset")
-        ]
+        terms = [(k, p) for k, p in enumerate(problem.parameters) if p.kind in DRIFTING]
         place = {k: 10 + i for i, (k, _) in enumerate(terms)}
         size = 10 + len(terms)
         scaled = np.zeros((size, n))
@@ -160,9 +163,7 @@ class LoadProblem:
             wide.append((to, B))
         centre, precision = self._prior(before, parameters)
         for k, p in terms:
-            level = abs(fit.phi[problem.index("coulomb", p.index)])
-            value = abs(fit.phi[k]) if p.kind != "offset" else level
-            precision[place[k]] = 1.0 / max(drift * value, 1e-6) ** 2
+            precision[place[k]] = 1.0 / max(drift[p.index] * friction_size(problem, fit.phi, k), 1e-6) ** 2
         H[np.arange(size), np.arange(size)] += precision
         g += precision * centre
         d = np.sqrt(np.diag(H))
@@ -172,7 +173,8 @@ class LoadProblem:
             # the rest follows the mass exactly
             x[:10] = x[0] * self._unit_point()
         # the drives' scales are considered, not estimated: a window cannot tell them from the load
-        doubt = np.array([j.sensing.torque_gain_std or GAIN_STD for j in self.builder.arm.joints])
+        stated = np.array([j.sensing.torque_gain_std for j in self.builder.arm.joints])
+        doubt = np.where(stated > 0.0, stated, fit.scale_std)
         through = (inverse @ scaled) * doubt
         inverse = inverse + through @ through.T
         residual = left - np.column_stack([B @ x[to] for to, B in wide])
@@ -185,7 +187,7 @@ class LoadProblem:
 
     def _prior(self, before: Array, parameters: int) -> tuple[Array, Array]:
         """Where the load's parameters are expected, and how firmly: (p,), (p,) 1/variance."""
-        drifting = sum(p.kind in ("coulomb", "viscous", "offset") for p in self.problem.parameters)
+        drifting = sum(p.kind in DRIFTING for p in self.problem.parameters)
         size = 10 + drifting
         centre, precision = np.zeros(size), np.zeros(size)
         mass = float(before[0])

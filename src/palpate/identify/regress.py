@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from palpate.arm import Arm, Array
 from palpate.errors import InputError
-from palpate.identify.data import RegressionData, Segment
+from palpate.identify.data import KINEMATIC_RATIO, RegressionData, Segment
 from palpate.identify.friction import (
     FrictionModel,
     FrictionShape,
@@ -33,6 +33,7 @@ _FRICTION_UNITS = {
     "offset": "N m",
     "stribeck": "N m",
     "load": "1",
+    "stiffness": "N m/rad",
 }
 HUBER = 1.345
 """residuals beyond this many standard deviations count linearly: 95 % efficient on normal noise"""
@@ -133,6 +134,12 @@ def parameters(arm: Arm, model: FrictionModel, *, links: bool = True) -> tuple[P
         name = "+".join(arm.joints[j].name for j in coupling.joints)
         for term, unit in (("rotor_inertia", "kg m^2"), ("viscous", "N m s/rad"), ("coulomb", "N m")):
             found.append(Parameter(f"{name}.{term}", unit, "coupling", c))
+    if model.springs and model.springs[-1] >= arm.n:
+        raise InputError(f"springs {model.springs}: the arm has joints 0 to {arm.n - 1}")
+    found += [
+        Parameter(f"{arm.joints[j].name}.stiffness", _FRICTION_UNITS["stiffness"], "stiffness", j)
+        for j in model.springs
+    ]
     return tuple(found)
 
 
@@ -177,7 +184,7 @@ class Builder:
         # until a joint has moved, nobody knows what friction it stopped with before the log
         moved = data.reduce(lambda s: (np.cumsum(np.abs(s.dq), axis=0) / s.rate > KNOWN_AFTER).astype(float))
         self.known = (moved > 0.99).astype(np.float64)
-        slow = REST * fastest(data)
+        slow = slowest(data)
         self.rest = data.reduce(lambda s: 1.0 - np.square(np.tanh(s.dq / slow))).clip(0.0, 1.0)
         self.rigid: list[Array] = []
         for j in range(n):
@@ -235,6 +242,7 @@ class Builder:
             self.data.reduce(lambda s, c=c: coupling_columns(c, s, shape.presliding[c.joints[0]]))  # type: ignore[misc]
             for c in model.couplings
         ]
+        turned = self.data.reduce(lambda s: s.q) if model.springs else self.data.q
         start = width + (n if model.rotor_inertia else 0)
         terms = len(model.terms)
         blocks = []
@@ -248,6 +256,9 @@ class Builder:
                 if j in coupling.joints:
                     at += range(start + terms * n + 3 * c, start + terms * n + 3 * c + 3)
                     parts.append(part)
+            if j in model.springs:
+                at.append(len(entries) - len(model.springs) + model.springs.index(j))
+                parts.append(turned[:, j])
             blocks.append((np.array(at, dtype=np.intp), np.column_stack(parts)))
         return Problem(entries, tuple(blocks), self.y, self.known, self.rest, self.data, model, shape)
 
@@ -272,7 +283,9 @@ class Builder:
         for j in range(n):
             at, A = problem.blocks[j]
             own = [k for k, i in enumerate(at) if problem.parameters[i].kind in _FRICTION_UNITS]
-            kept = [k for k in own if problem.parameters[at[k]].kind in ("viscous", "offset", "load")]
+            kept = [
+                k for k in own if problem.parameters[at[k]].kind in ("viscous", "offset", "load", "stiffness")
+            ]
             root = np.sqrt(solution.weights[:, j])
             rest = (problem.y[:, j] - A @ solution.phi[at] + A[:, own] @ solution.phi[at[own]]) * root
             fixed = A[:, kept] * root[:, None]
@@ -318,6 +331,16 @@ def check_transmission(transmission: Array | None, n: int) -> Array | None:
 def fastest(data: RegressionData) -> Array:
     """(n,) largest speed of each joint in the data [rad/s], at least 1e-6."""
     return np.maximum(np.abs(data.dq).max(axis=0), 1e-6)
+
+
+def slowest(data: RegressionData) -> Array:
+    """(n,) speed below which a joint counts as at rest [rad/s].
+
+    A part of its fastest speed, but no less than what one step of the encoder looks like after the kinematic
+    low-pass: a peak of twice the cutoff times the step.
+    """
+    step: Array = 2.0 * KINEMATIC_RATIO * data.cutoff * data.resolution
+    return np.maximum(REST * fastest(data), step)
 
 
 def normal(problem: Problem, weights: Array) -> tuple[Array, Array]:

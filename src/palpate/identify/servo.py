@@ -23,11 +23,13 @@ from palpate.arm import Arm, Array
 from palpate.errors import InputError, LogError, MissingExtraError
 from palpate.identify.data import LEAST_CUTOFF, RegressionData, Segment, prepare
 from palpate.identify.friction import remembered_sign
-from palpate.identify.regress import REST, fastest
+from palpate.identify.regress import slowest
 from palpate.logs import Log
 
 PRESLIDING = 3e-3
 """x_0 of small gear trains [rad]"""
+MOVING = 0.9
+"""share of motion (1 less how much of it is rest) that one row of a log must have for the log to show motion"""
 START = (30.0, 2e-3, 0.05, 5e-3)
 """where the search starts: W/(N m)^2, kg m^2, N m, N m s/rad; small geared servos are within a decade"""
 
@@ -71,6 +73,26 @@ class BusDrive:
         parts = _columns(self, data, volts)
         return parts @ np.array([1.0, -self.rotor_inertia, -self.viscous, -self.coulomb]), data
 
+    def weigh(self, arm: Arm, log: Log, *, voltage: str = "voltage") -> float:
+        """Mass [kg] that hangs on the servo in a log, by least squares over the rows in motion.
+
+        Args:
+            arm: one joint; its link is the load, of any mass: only where the mass sits counts.
+            log: as in :func:`fit_bus_drive`.
+            voltage: name of the signal with the supply voltage.
+
+        Raises:
+            InputError, LogError: as in :func:`fit_bus_drive`; the log shows no motion.
+        """
+        _check(arm)
+        torque, data = self.load_torque(log, voltage=voltage)
+        expected = data.reduce(lambda s: arm.inverse_dynamics(s.q, s.dq, s.ddq))[:, 0]
+        moving = 1.0 - _rest(data)
+        weighted = moving * expected
+        if moving.max() < MOVING or not np.any(weighted):
+            raise LogError("the servo does not move: at rest its friction is anywhere within +-F_c")
+        return float(arm.joints[0].mass * (weighted @ torque) / (weighted @ expected))
+
 
 def fit_bus_drive(arm: Arm, logs: Log | Sequence[Log], *, voltage: str = "voltage") -> BusDrive:
     """Find a = R/k_t^2, rotor inertia and friction of a servo from motion with a known load.
@@ -89,8 +111,7 @@ def fit_bus_drive(arm: Arm, logs: Log | Sequence[Log], *, voltage: str = "voltag
         from scipy.optimize import least_squares
     except ImportError:
         raise MissingExtraError("identify", "identification") from None
-    if arm.n != 1 or not arm.has_dynamics:
-        raise InputError(f"a servo is fitted with an arm of one joint that has a mass, got {arm!r}")
+    _check(arm)
     every = (logs,) if isinstance(logs, Log) else tuple(logs)
     if not every:
         raise InputError("a servo is fitted from at least one log with its known load")
@@ -112,6 +133,11 @@ def fit_bus_drive(arm: Arm, logs: Log | Sequence[Log], *, voltage: str = "voltag
 
     best = least_squares(residual, np.log(START), loss="soft_l1", f_scale=0.02)
     return drive(best.x, float(np.sqrt(np.mean(np.square(residual(best.x))))))
+
+
+def _check(arm: Arm) -> None:
+    if arm.n != 1 or not arm.has_dynamics:
+        raise InputError(f"a servo is fitted with an arm of one joint that has a mass, got {arm!r}")
 
 
 def _prepare(log: Log, voltage: str) -> tuple[RegressionData, Array]:
@@ -137,7 +163,7 @@ def _prepare(log: Log, voltage: str) -> tuple[RegressionData, Array]:
 
 
 def _rest(data: RegressionData) -> Array:
-    slow = REST * fastest(data)
+    slow = slowest(data)
     rest: Array = data.reduce(lambda s: 1.0 - np.square(np.tanh(s.dq / slow)))[:, 0].clip(0.0, 1.0)
     return rest
 

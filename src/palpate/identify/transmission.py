@@ -70,6 +70,7 @@ def fit_transmission(
     *,
     reference: str,
     friction: str | FrictionModel = "stribeck+load",
+    alike: Sequence[Sequence[int]] = (),
     cutoff: float | None = None,
 ) -> TransmissionFit:
     """Fit what the drives lose, from logs with the motor's effort and a joint torque sensor.
@@ -79,14 +80,20 @@ def fit_transmission(
         logs: one or several.
         reference: name of the signal (M, n) with the sensor's torque [N m].
         friction: as in :func:`palpate.identify.fit`.
+        alike: groups of joints, by index, that have the same drive: they share one rotor inertia. A motor and its
+            gear are made alike; their friction is not.
         cutoff: parallel low-pass [Hz].
 
     Raises:
-        InputError, LogError: as in :func:`palpate.identify.fit`.
+        InputError, LogError: as in :func:`palpate.identify.fit`; a joint is in two groups or does not exist.
     """
     model = friction if isinstance(friction, FrictionModel) else FrictionModel.named(friction)
     every = (logs,) if isinstance(logs, Log) else tuple(logs)
     n = arm.n
+    groups = tuple(tuple(int(j) for j in group) for group in alike)
+    members = [j for group in groups for j in group]
+    if len(set(members)) < len(members) or not all(0 <= j < n for j in members):
+        raise InputError(f"alike must be groups of different joints from 0 to {n - 1}, got {groups}")
     middle = model.presliding[len(model.presliding) // 2]
     data, builder, tau = _builder(arm, every, reference, cutoff)
     shape = FrictionShape((middle,) * n, tuple((0.1 * fastest(data)).tolist()))
@@ -97,7 +104,7 @@ def fit_transmission(
         problem = builder.problem(model, shape)
         solution = least_squares(problem)
     known = problem.known > 0.0
-    phi, std = _bounded(problem, solution)
+    phi, std = _bounded(problem, solution, groups)
     torque = problem.y + tau - problem.predict(phi)
     seen = known.any(axis=1)
     moving = 0.02 * fastest(data)
@@ -119,8 +126,8 @@ def fit_transmission(
     )
 
 
-def _bounded(problem: Problem, solution: Solution) -> tuple[Array, Array]:
-    """Weighted least squares per joint with rotor inertia and frictions >= 0; values and standard deviations.
+def _bounded(problem: Problem, solution: Solution, groups: Sequence[tuple[int, ...]]) -> tuple[Array, Array]:
+    """Weighted least squares with rotor inertia and frictions >= 0; values and standard deviations.
 
     A ridge of 1 % of each column keeps apart what one-way motion cannot (Coulomb friction and offset share the
     blame); where the motion tells them apart it moves them by 1e-4.
@@ -129,23 +136,34 @@ def _bounded(problem: Problem, solution: Solution) -> tuple[Array, Array]:
         from scipy.optimize import lsq_linear
     except ImportError:
         raise MissingExtraError("identify", "identification") from None
-    phi = np.zeros(len(problem.parameters))
-    std = np.zeros_like(phi)
+    count = len(problem.parameters)
+    leader = np.arange(count)
+    for group in groups if problem.model.rotor_inertia else ():
+        leader[[problem.index("rotor", j) for j in group]] = problem.index("rotor", group[0])
+    rows, right = [], []
     for j, (at, A) in enumerate(problem.blocks):
         root = np.sqrt(solution.weights[:, j] / solution.inflation[j])
-        B = A * root[:, None]
-        size = np.linalg.norm(B, axis=0)
-        ridge = 0.01 * np.where(size > 0.0, size, 1.0)
-        for k, i in enumerate(at):
-            if problem.parameters[i].kind == "load":
-                ridge[k] = max(ridge[k], 1.0 / LOAD_FRICTION_STD)
-        scale = np.sqrt(np.square(size) + np.square(ridge))
-        stacked = np.vstack([B, np.diag(ridge)]) / scale
-        right = np.r_[root * problem.y[:, j], np.zeros(len(at))]
-        low = [0.0 if problem.parameters[i].kind in POSITIVE else -np.inf for i in at]
-        phi[at] = lsq_linear(stacked, right, bounds=(low, np.inf)).x / scale
-        std[at] = np.sqrt(np.diag(np.linalg.inv(stacked.T @ stacked))) / scale
-    return phi, std
+        wide = np.zeros((len(A), count))
+        wide[:, leader[at]] = A * root[:, None]
+        rows.append(wide)
+        right.append(root * problem.y[:, j])
+    used = np.unique(leader)
+    B = np.vstack(rows)[:, used]
+    size = np.linalg.norm(B, axis=0)
+    ridge = 0.01 * np.where(size > 0.0, size, 1.0)
+    kinds = [problem.parameters[i].kind for i in used]
+    for k, kind in enumerate(kinds):
+        if kind == "load":
+            ridge[k] = max(ridge[k], 1.0 / LOAD_FRICTION_STD)
+    scale = np.sqrt(np.square(size) + np.square(ridge))
+    stacked = np.vstack([B, np.diag(ridge)]) / scale
+    low = [0.0 if kind in POSITIVE else -np.inf for kind in kinds]
+    found, std = np.zeros(count), np.zeros(count)
+    found[used] = (
+        lsq_linear(stacked, np.concatenate([*right, np.zeros(len(used))]), bounds=(low, np.inf)).x / scale
+    )
+    std[used] = np.sqrt(np.diag(np.linalg.inv(stacked.T @ stacked))) / scale
+    return found[leader], std[leader]
 
 
 def _builder(

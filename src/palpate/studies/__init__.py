@@ -98,6 +98,9 @@ _ALL = (
     Study("contacts", "Contacts found and not found: a real UR10e, and 100 h of two simulated arms", "bench"),
     Study("feedback", "What is weighed is fed back to the controller", "bench"),
     Study("box-inertias", "The same arm with inertias a body can have", "bench"),
+    Study(
+        "accuracy", "Recordings of real robots: identification, drive gains, loads, and the rivals", "bench"
+    ),
     Study("replay", "Live, offline, replayed, chunked: the same bits; import time and size", "bench"),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
