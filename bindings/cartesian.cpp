@@ -38,7 +38,9 @@ void bind_cartesian(nb::module_& m) {
                                {"delta_b", &AbagParameters::delta_b, "by so much per step [1]"},
                                {"theta_g", &AbagParameters::theta_g, "above this mean sign the gain grows, below it shrinks [1]"},
                                {"delta_g", &AbagParameters::delta_g, "by so much per step [1]"},
-                               {"period", &AbagParameters::period, "of the steps these numbers were made for [s]"}})
+                               {"period", &AbagParameters::period, "of the steps these numbers were made for [s]"},
+                               {"band", &AbagParameters::band, "errors up to this count in part [unit of the error]; 0: the paper's sign"},
+                               {"least_gain", &AbagParameters::least_gain, "lower end of the gain [1]; 0: the paper's"}})
       .def_static("whiteboard", &AbagParameters::whiteboard, "The whiteboard project's, 8 ms.")
       .def_static("kinova", &AbagParameters::kinova, "Those for a Kinova Gen3 at 1 kHz.")
       .def("at", &AbagParameters::at, nb::arg("period"), "The same behaviour in time with steps of another period [s].");
@@ -79,8 +81,6 @@ void bind_cartesian(nb::module_& m) {
                  {{"axes", &C::axes, "'per_axis': an ABAG for each task axis; 'heading': one on the speed towards the goal"},
                   {"abag", &C::abag, "AbagParameters of the velocity"},
                   {"abag_turning", &C::abag_turning, "AbagParameters of the angular velocity"},
-                  {"dead_band", &C::dead_band, "a velocity error below counts as none [m/s]"},
-                  {"dead_band_turning", &C::dead_band_turning, "[rad/s]"},
                   {"max_force", &C::max_force, "the norm of the commanded force never exceeds it [N]"},
                   {"max_torque", &C::max_torque, "the norm of the commanded torque never exceeds it [N m]"},
                   {"slow_speed", &C::slow_speed, "within slow_zone of the goal [m/s]"},
@@ -95,7 +95,10 @@ void bind_cartesian(nb::module_& m) {
                   {"force_i", &C::force_i, "of its integral [1/s]"},
                   {"yield_force", &C::yield_force, "a push beyond this makes the arm yield [N]; infinity: never"},
                   {"yield_time", &C::yield_time, "after a push, until the task goes on [s]"},
-                  {"yield_damping", &C::yield_damping, "while yielding, force per velocity [N s/m]"},
+                  {"free_speed", &C::free_speed, "the brake acts beyond this, and beyond 1.5 times the wanted speed [m/s]"},
+                  {"free_turning", &C::free_turning, "[rad/s]"},
+                  {"brake", &C::brake, "force against the speed beyond [N s/m]; 0: none"},
+                  {"brake_turning", &C::brake_turning, "torque against the turning beyond [N m s/rad]"},
                   {"posture", &C::posture, "Posture"},
                   {"errata", &C::errata, "VelocityErrata"}})
       .def_static("published", [](const std::string& axes) {
@@ -118,11 +121,11 @@ void bind_cartesian(nb::module_& m) {
           external.status = Status::ok;
         }
         const CartesianCommand c = self.controller.step(target, joints(q, n, "q"), joints(dq, n, "dq"), external, load);
-        return nb::make_tuple(array(c.joints.torque, n), c.joints.status, numbers(c.force), numbers(c.torque), numbers(c.velocity), numbers(c.wanted),
+        return nb::make_tuple(array(c.joints.torque, n), c.joints.status, numbers(c.force), numbers(c.torque), numbers(c.brake), numbers(c.velocity), numbers(c.wanted),
                               c.distance, c.contact_force, c.arrived, c.yielding);
       }, nb::arg("position"), nb::arg("orientation"), nb::arg("speed"), nb::arg("velocity"), nb::arg("axes"), nb::arg("normal_force"), nb::arg("q"),
            nb::arg("dq"), nb::arg("force").none(), nb::arg("load"),
-           "Returns (joint torque, status, force, torque, velocity, wanted velocity, distance, contact force, arrived, yielding).")
+           "Returns (joint torque, status, force, torque, brake, velocity, wanted velocity, distance, contact force, arrived, yielding).")
       .def("abag", [](const PyCartesianVelocity& self) {
         return nb::make_tuple(state(self.controller.abag(0)), state(self.controller.abag(1)), state(self.controller.abag(2)));
       }, "(e_bar, b, g, u) of the three task axes; in mode 'heading' the first is the one in use.")

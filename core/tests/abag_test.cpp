@@ -49,7 +49,7 @@ TEST(Abag, NothingLeavesItsBounds) {
   Random r(1);
   for (const AbagForm form : {AbagForm::corrected, AbagForm::negative_gain}) {
     for (int trial = 0; trial < 50; ++trial) {
-      const AbagParameters p{r(0.0, 0.999), r(0.0, 1.0), r(1e-4, 3.0), r(0.0, 1.0), r(1e-4, 3.0), 0.008};
+      const AbagParameters p{r(0.0, 0.999), r(0.0, 1.0), r(1e-4, 3.0), r(0.0, 1.0), r(1e-4, 3.0), 0.008, trial % 2 == 0 ? 0.0 : r(0.0, 1.0), 0.0};
       Abag a(p, form);
       for (int k = 0; k < 500; ++k) {
         const double pick = r(0.0, 1.0);

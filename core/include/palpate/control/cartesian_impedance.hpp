@@ -58,7 +58,7 @@ class CartesianImpedance {
       out.torque[i] = kr * r[i] - 2.0 * c_.damping_ratio * std::sqrt(kr * c_.inertia) * w[i];
     }
     JointVector tau = inverse_dynamics<double>(*arm_, q, dq, JointVector{}, load);
-    const JointVector friction = arm_->friction_torque(dq), posture = posture_.torque(tool, q, dq, load);
+    const JointVector friction = arm_->friction_torque(dq), posture = posture_.torque(tool, TaskDynamics(*arm_, tool, q, load), q, dq);
     for (std::size_t j = 0; j < n; ++j) tau[j] += friction[j] + posture[j];
     tool.add_wrench(Arm::to_vec(out.force), Arm::to_vec(out.torque), arm_->n(), tau);
     if (!check::all_finite(tau, n)) return out;

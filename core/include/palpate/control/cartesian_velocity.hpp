@@ -23,10 +23,8 @@ struct VelocityErrata {
 /// One set of ABAG parameters each for positions and orientations, bounds, the speed profile, and what a contact may do.
 struct CartesianVelocityConfig {
   VelocityAxes axes = VelocityAxes::per_axis;
-  AbagParameters abag{0.6, 0.3, 0.004, 0.5, 0.008, 0.004};         ///< of the velocity
-  AbagParameters abag_turning{0.6, 0.3, 0.004, 0.5, 0.008, 0.004}; ///< of the angular velocity
-  double dead_band = 0.002;         ///< a velocity error below counts as none [m/s], >= 0
-  double dead_band_turning = 0.01;  ///< [rad/s], >= 0
+  AbagParameters abag{0.5, 0.0, 0.004, 0.5, 0.008, 0.004, 0.03, 0.3};         ///< of the velocity
+  AbagParameters abag_turning{0.5, 0.0, 0.004, 0.5, 0.008, 0.004, 0.3, 0.3};  ///< of the angular velocity
   double max_force = 5.0;           ///< F_max: ||F|| never exceeds it [N], > 0
   double max_torque = 2.0;          ///< T_max: ||T|| never exceeds it [N m], > 0
   double slow_speed = 0.02;         ///< within slow_zone of the goal [m/s], > 0
@@ -41,7 +39,10 @@ struct CartesianVelocityConfig {
   double force_i = 2.0;             ///< of its integral [1/s], >= 0
   double yield_force = 12.0;        ///< a push beyond this, the expected contact taken away, makes the arm yield [N], > 0; infinity: never
   double yield_time = 0.3;          ///< after a push, until the task goes on [s], >= 0
-  double yield_damping = 5.0;       ///< while yielding, F = -d v [N s/m], >= 0
+  double free_speed = 0.4;          ///< beyond this, and beyond 1.5 times the wanted speed, the brake acts [m/s], > 0
+  double free_turning = 1.0;        ///< [rad/s], > 0
+  double brake = 60.0;              ///< force against the speed beyond, against any speed while yielding [N s/m], >= 0; 0: none
+  double brake_turning = 1.0;       ///< torque against the turning beyond [N m s/rad], >= 0
   PostureConfig posture{};
   VelocityErrata errata{};
 
@@ -50,8 +51,8 @@ struct CartesianVelocityConfig {
     CartesianVelocityConfig c;
     c.axes = axes;
     c.abag = c.abag_turning = AbagParameters::whiteboard();
-    c.dead_band = c.dead_band_turning = 0.0;
     c.yield_force = std::numeric_limits<double>::infinity();
+    c.brake = c.brake_turning = 0.0;
     c.errata = {true, false, true, true, true};
     return c;
   }
@@ -72,6 +73,7 @@ struct CartesianCommand {
   JointCommand joints{};              ///< torque of the drives; status: the worst of what follows
   std::array<double, 3> force{};      ///< F at the tool point [N], ||F|| <= F_max
   std::array<double, 3> torque{};     ///< T [N m], ||T|| <= T_max
+  std::array<double, 3> brake{};      ///< force of the brake beside F [N]: against the motion, never with it
   std::array<double, 3> velocity{};   ///< of the tool point [m/s]
   std::array<double, 3> wanted{};     ///< [m/s]
   double distance = 0.0;              ///< to the position, in the plane of the surface while pressing [m]
@@ -85,9 +87,10 @@ struct CartesianCommand {
 ///   h = x_des - x,   v_h = v . h/||h|| the speed towards the goal, with its sign,   v_des by the profile
 ///   (a)  F = F_max u(v_des - v_h) h/||h||            one ABAG
 ///   (b)  F = F_max sum_i u_i(v_des h_i/||h|| - v_i) e_i   one ABAG per task axis e_i; a moving goal's velocity is added
-///   T = T_max sum_i u_i(w_des,i - w_i) e_i,  w_des = k phi, bounded; phi the rotation vector of R_des R^T
+///   T = T_max L sum_i u_i(w_des,i - w_i) e_i,  w_des = k phi, bounded; phi the rotation vector of R_des R^T; L the tool's inertia
+///       against turning, scaled to norm 1: light axes (the flange's own) get little
 ///   ||F|| <= F_max, ||T|| <= T_max, the direction kept
-///   tau = J^T (F; T) + C q' + g + tau_f(q') + tau_n      (tau_n: NullSpacePosture, moves no tool)
+///   tau = J^T ((F; T) + D) + C q' + g + tau_f(q') + tau_n      (tau_n: NullSpacePosture, moves no tool)
 ///
 /// Profile: v_des = min(speed, k d), and slow_speed within slow_zone of a goal to stop at; v_des -> 0 with d, so the tool stops at
 /// the goal and comes back to it. (W wanted no speed within 0.02 m and kept pushing by a bias learnt on the way.)
@@ -99,7 +102,11 @@ struct CartesianCommand {
 /// sqrt(F_max^2 - F_n^2). Without an estimate that may be believed nothing is pressed and nothing moves (status held).
 ///
 /// A push (external force beyond yield_force, the contact's own force taken away) makes the arm yield: ABAGs and integral are
-/// cleared, F = -yield_damping v within the bound, T = 0, until it has been gone for yield_time.
+/// cleared and F = 0 until it has been gone for yield_time. The tool keeps its orientation.
+///
+/// D is no part of F: a brake against what the task never does, speed beyond free_speed and 1.5 times the wanted one, and any speed
+/// while yielding or not knowing what is touched. Without it a push of 30 N throws an arm that may answer with 5 N only. It takes energy
+/// out and never adds any.
 ///
 /// A state or target that is not finite gives F = T = 0: gravity alone where q is known, else the last torque that held it.
 class CartesianVelocity {
@@ -108,8 +115,6 @@ class CartesianVelocity {
   CartesianVelocity(const Arm& arm, double period, const CartesianVelocityConfig& config = {})
       : arm_(&arm), c_(config), h_(check::positive("CartesianVelocity period [s]", period)), posture_(arm, config.posture) {
     if (!arm.has_dynamics()) throw std::invalid_argument("CartesianVelocity: the arm has no masses; give inertials");
-    check::not_negative("CartesianVelocityConfig dead_band [m/s]", config.dead_band);
-    check::not_negative("CartesianVelocityConfig dead_band_turning [rad/s]", config.dead_band_turning);
     check::positive("CartesianVelocityConfig max_force [N]", config.max_force);
     check::positive("CartesianVelocityConfig max_torque [N m]", config.max_torque);
     check::positive("CartesianVelocityConfig slow_speed [m/s]", config.slow_speed);
@@ -124,7 +129,10 @@ class CartesianVelocity {
     check::not_negative("CartesianVelocityConfig force_i [1/s]", config.force_i);
     check::positive_or_infinite("CartesianVelocityConfig yield_force [N]", config.yield_force);
     check::not_negative("CartesianVelocityConfig yield_time [s]", config.yield_time);
-    check::not_negative("CartesianVelocityConfig yield_damping [N s/m]", config.yield_damping);
+    check::positive("CartesianVelocityConfig free_speed [m/s]", config.free_speed);
+    check::positive("CartesianVelocityConfig free_turning [rad/s]", config.free_turning);
+    check::not_negative("CartesianVelocityConfig brake [N s/m]", config.brake);
+    check::not_negative("CartesianVelocityConfig brake_turning [N m s/rad]", config.brake_turning);
     const AbagForm form = config.errata.negative_gain ? AbagForm::negative_gain : AbagForm::corrected;
     along_.fill(Abag(config.abag.at(period), form));
     turn_.fill(Abag(config.abag_turning.at(period), form));
@@ -147,6 +155,7 @@ class CartesianVelocity {
       return out;
     }
     const ToolState tool(*arm_, q, dq);
+    const TaskDynamics dynamics(*arm_, tool, q, load);
     const Mat3<double> A = Arm::to_mat(target.axes);
     const Vec3<double> v = transposed(A, tool.v), h = transposed(A, Arm::to_vec(target.position) - tool.x);  // task axes
     const Vec3<double> lead = transposed(A, Arm::to_vec(target.velocity));
@@ -168,9 +177,10 @@ class CartesianVelocity {
     const Vec3<double> in_plane{h.x, h.y, pressing ? 0.0 : h.z};
     out.distance = std::sqrt(dot(in_plane, in_plane));
     out.arrived = out.distance <= c_.arrived;
+    if (blind) rest();
     if (out.yielding || blind) {
-      rest();
-      F = bounded(-c_.yield_damping * v, c_.max_force);
+      for (Abag& a : along_) a.reset();
+      integral_ = 0.0;
     } else {
       wanted = lead + wanted_velocity(in_plane, out.distance, target.speed, dot(lead, lead) == 0.0);
       if (pressing) {
@@ -186,20 +196,23 @@ class CartesianVelocity {
         F = c_.max_force * Vec3<double>{axis(0, wanted.x - v.x), axis(1, wanted.y - v.y), axis(2, wanted.z - v.z)};
         if (!c_.errata.axis_bound) F = bounded(F, c_.max_force);
       }
-      T = turning(target, tool);
     }
+    if (!blind) T = turning(target, tool, dynamics);
     const Vec3<double> F_base = c_.errata.axis_bound ? A * F : bounded(A * F, c_.max_force);
     put(out.force, F_base), put(out.torque, T), put(out.velocity, tool.v), put(out.wanted, A * wanted);
+    const double free_speed = out.yielding || blind ? 0.0 : std::max(c_.free_speed, 1.5 * (target.speed + std::sqrt(dot(lead, lead))));
+    const Vec3<double> D = -c_.brake * excess(tool.v, free_speed), D_turning = -c_.brake_turning * excess(tool.w, c_.free_turning);
+    put(out.brake, D);
 
     JointVector tau = inverse_dynamics<double>(*arm_, q, dq, JointVector{}, load);
     const JointVector friction = arm_->friction_torque(dq);
-    const JointVector posture = posture_.torque(tool, q, dq, load);
+    const JointVector posture = posture_.torque(tool, dynamics, q, dq);
     for (std::size_t j = 0; j < n; ++j) tau[j] += friction[j] + posture[j];
-    tool.add_wrench(c_.errata.turned_twice ? tool.R * (tool.R * F_base) : F_base, T, arm_->n(), tau);
+    tool.add_wrench((c_.errata.turned_twice ? tool.R * (tool.R * F_base) : F_base) + D, T + dynamics.turning(D_turning), arm_->n(), tau);
     if (!check::all_finite(tau, n)) {
       out.joints.torque = holding_;
       out.joints.status = Status::non_finite;
-      out.force = out.torque = {};
+      out.force = out.torque = out.brake = {};
       rest();
       return out;
     }
@@ -228,6 +241,8 @@ class CartesianVelocity {
     for (std::size_t j = 0; j < n; ++j) most = std::max(most, std::abs(x[j]));
     return most;
   }
+  /// The part of a velocity beyond `free`.
+  static Vec3<double> excess(const Vec3<double>& v, double free) noexcept { return free > 0.0 ? v - bounded(v, free) : v; }
   static void put(std::array<double, 3>& to, const Vec3<double>& a) noexcept { to = {a.x, a.y, a.z}; }
   static bool rotation(const std::array<double, 9>& r) noexcept {
     if (!check::all_finite(r, 9)) return false;
@@ -248,7 +263,7 @@ class CartesianVelocity {
     integral_ = 0.0;
   }
 
-  [[nodiscard]] double axis(std::size_t i, double error) noexcept { return along_[i].step(std::abs(error) < c_.dead_band ? 0.0 : error); }
+  [[nodiscard]] double axis(std::size_t i, double error) noexcept { return along_[i].step(error); }
 
   [[nodiscard]] Vec3<double> wanted_velocity(const Vec3<double>& h, double distance, double speed, bool stops) const noexcept {
     if (distance == 0.0) return {};
@@ -266,12 +281,11 @@ class CartesianVelocity {
     return (c_.max_force * axis(0, dot(wanted, unit) - (c_.errata.unsigned_speed ? std::abs(speed) : speed))) * unit;
   }
 
-  [[nodiscard]] Vec3<double> turning(const CartesianTarget& target, const ToolState& tool) noexcept {
+  [[nodiscard]] Vec3<double> turning(const CartesianTarget& target, const ToolState& tool, const TaskDynamics& dynamics) noexcept {
     const Vec3<double> phi = rotation_vector(Arm::to_mat(target.orientation) * transpose(tool.R));
     const Vec3<double> e = bounded(c_.turning * phi, c_.max_turning) - tool.w;
-    const auto one = [this](std::size_t i, double error) { return turn_[i].step(std::abs(error) < c_.dead_band_turning ? 0.0 : error); };
-    const Vec3<double> T = c_.max_torque * Vec3<double>{one(0, e.x), one(1, e.y), one(2, e.z)};
-    return bounded(T, c_.max_torque);
+    const Vec3<double> u{turn_[0].step(e.x), turn_[1].step(e.y), turn_[2].step(e.z)};
+    return bounded(dynamics.turning(c_.max_torque * u), c_.max_torque);
   }
 
   /// Along the outward normal, <= 0: a tool presses, it does not pull.

@@ -69,6 +69,53 @@ struct ToolState {
   }
 };
 
+/// What moves how under a wrench at the tool: M^-1 J^T by joint, and A = J M^-1 J^T, the inverse of the task-space inertia.
+struct TaskDynamics {
+  static constexpr int stride = 6;
+  std::array<double, static_cast<std::size_t>(max_joints * stride)> Jt{}, X{};  ///< rows of J^T and of M^-1 J^T, one per joint
+  JointMatrix A{};  ///< 6 x 6, force before moment [1/kg, 1/(kg m), 1/(kg m^2)]
+  bool good;        ///< M was positive definite
+
+  TaskDynamics(const Arm& arm, const ToolState& tool, const JointVector& q, const Inertia<double>& load) noexcept {
+    const int n = arm.n();
+    for (int j = 0; j < n; ++j) {
+      const Vec3<double>&v = tool.Jv[detail::at(j)], &w = tool.Jw[detail::at(j)];
+      double* row = Jt.data() + j * stride;
+      row[0] = v.x, row[1] = v.y, row[2] = v.z, row[3] = w.x, row[4] = w.y, row[5] = w.z;
+    }
+    X = Jt;
+    const Cholesky<double> M(mass_matrix<double>(arm, q, load), n);
+    good = M.positive();
+    M.solve_rows(X.data(), stride, stride);
+    for (int j = 0; j < n; ++j)
+      for (int r = 0; r < 6; ++r)
+        for (int c = r; c < 6; ++c) A(r, c) += Jt[detail::at(j * stride + r)] * X[detail::at(j * stride + c)];
+    for (int r = 0; r < 6; ++r)
+      for (int c = 0; c < r; ++c) A(r, c) = A(c, r);
+  }
+
+  /// (J_w M^-1 J_w^T)^-1 a, divided by the Frobenius norm of that matrix: a torque that turns the tool about `a` and not across it,
+  /// no longer than `a`. `a` itself where the arm cannot turn the tool about every axis.
+  [[nodiscard]] Vec3<double> turning(const Vec3<double>& a) const noexcept {
+    JointMatrix W{};
+    for (int r = 0; r < 3; ++r)
+      for (int c = 0; c < 3; ++c) W(r, c) = A(r + 3, c + 3);
+    const Cholesky<double> factor(W, 3);
+    if (!good || !factor.positive()) return a;
+    double squares = 0.0;
+    for (std::size_t c = 0; c < 3; ++c) {
+      JointVector unit{};
+      unit[c] = 1.0;
+      const JointVector x = factor.solve(unit);
+      squares += x[0] * x[0] + x[1] * x[1] + x[2] * x[2];
+    }
+    const JointVector x = factor.solve({a.x, a.y, a.z});
+    const double s = 1.0 / std::sqrt(squares);
+    const Vec3<double> out{s * x[0], s * x[1], s * x[2]};
+    return std::isfinite(dot(out, out)) ? out : a;
+  }
+};
+
 struct PostureConfig {
   double stiffness = 2.0;      ///< k_n: torque per gradient of the posture's worth [N m], >= 0; 0: only damping
   double damping = 2.0;        ///< d_n: of motion that does not move the tool [N m s/rad], >= 0
@@ -127,39 +174,19 @@ class NullSpacePosture {
     return out;
   }
 
-  /// tau_n [N m]; load: what is held, a body on the last link.
-  [[nodiscard]] JointVector torque(const ToolState& tool, const JointVector& q, const JointVector& dq, const Inertia<double>& load) const noexcept {
+  /// tau_n [N m].
+  [[nodiscard]] JointVector torque(const ToolState& tool, const TaskDynamics& dynamics, const JointVector& q, const JointVector& dq) const noexcept {
     const int n = arm_->n();
-    if (n <= 6) return {};
+    if (n <= 6 || !dynamics.good) return {};
+    const Cholesky<double> inertia(dynamics.A, 6);
+    if (!inertia.positive()) return {};
     const JointVector slope = gradient(tool, q);
-    JointVector tau{};
+    JointVector tau{}, b{};
     for (int j = 0; j < n; ++j) {
       const auto u = detail::at(j);
       tau[u] = std::clamp(c_.stiffness * slope[u] - c_.damping * dq[u], -c_.largest, c_.largest);
+      for (int r = 0; r < 6; ++r) b[detail::at(r)] += dynamics.X[detail::at(j * TaskDynamics::stride + r)] * tau[u];
     }
-    // rows of [J^T | tau], then M^-1 of them
-    constexpr int stride = 7;
-    std::array<double, static_cast<std::size_t>(max_joints * stride)> Jt{}, X;
-    for (int j = 0; j < n; ++j) {
-      const std::array<double, 6> J = column(tool, j);
-      std::copy(J.begin(), J.end(), Jt.begin() + j * stride);
-      Jt[detail::at(j * stride + 6)] = tau[detail::at(j)];
-    }
-    X = Jt;
-    const Cholesky<double> M(mass_matrix<double>(*arm_, q, load), n);
-    M.solve_rows(X.data(), stride, stride);
-    JointMatrix A{};
-    JointVector b{};
-    for (int j = 0; j < n; ++j)
-      for (int r = 0; r < 6; ++r) {
-        const double J = Jt[detail::at(j * stride + r)];
-        for (int c = r; c < 6; ++c) A(r, c) += J * X[detail::at(j * stride + c)];
-        b[detail::at(r)] += J * X[detail::at(j * stride + 6)];
-      }
-    for (int r = 0; r < 6; ++r)
-      for (int c = 0; c < r; ++c) A(r, c) = A(c, r);
-    const Cholesky<double> inertia(A, 6);
-    if (!M.positive() || !inertia.positive()) return {};
     const JointVector f = inertia.solve(b);
     tool.add_wrench({-f[0], -f[1], -f[2]}, {-f[3], -f[4], -f[5]}, n, tau);
     return check::all_finite(tau, detail::at(n)) ? tau : JointVector{};
