@@ -6,7 +6,7 @@ namespace palpate {
 
 struct CartesianImpedanceConfig {
   std::array<double, 3> stiffness{500, 500, 500};       ///< k_c along base axes [N/m], >= 0
-  std::array<double, 3> turning_stiffness{30, 30, 30};  ///< about base axes [N m/rad], >= 0
+  std::array<double, 3> turning_stiffness{30, 30, 30};  ///< about base axes [N m/rad], >= 0; less where the tool turns lightly
   double damping_ratio = 0.7;                           ///< d_c [1], >= 0: D = 2 d_c sqrt(k_c m)
   double mass = 5.0;                                    ///< m that the damping is made for [kg], > 0
   double inertia = 0.1;                                 ///< and for turning [kg m^2], > 0
@@ -15,6 +15,7 @@ struct CartesianImpedanceConfig {
 
 /// tau = J^T [k_c (x_ref - x) + F] + D(d_c) + f_dyn(q, q', q'')      (W; MATH.md section 8)
 ///
+/// Turning about a light axis gets spring and damper in proportion to its inertia (TaskDynamics::turning), or the flange's own axis rattles.
 /// x_ref, R_ref the pose of the virtual spring's other end; F [N] a force beside it; D = -2 d_c J^T sqrt(k_c m) v; f_dyn = C q' + g +
 /// tau_f(q') + tau_n of this arm with its load, q'' = 0. The force grows with the distance and has no bound: that is what CartesianVelocity
 /// does better. A state that is not finite gives the gravity torque last known, status non_finite.
@@ -52,15 +53,19 @@ class CartesianImpedance {
     const ToolState tool(*arm_, q, dq);
     const Vec3<double> d = Arm::to_vec(position) - tool.x, phi = rotation_vector(Arm::to_mat(orientation) * transpose(tool.R));
     const std::array<double, 3> x{d.x, d.y, d.z}, v{tool.v.x, tool.v.y, tool.v.z}, r{phi.x, phi.y, phi.z}, w{tool.w.x, tool.w.y, tool.w.z};
+    std::array<double, 3> T{};
     for (std::size_t i = 0; i < 3; ++i) {
       const double k = c_.stiffness[i], kr = c_.turning_stiffness[i];
       out.force[i] = k * x[i] + force[i] - 2.0 * c_.damping_ratio * std::sqrt(k * c_.mass) * v[i];
-      out.torque[i] = kr * r[i] - 2.0 * c_.damping_ratio * std::sqrt(kr * c_.inertia) * w[i];
+      T[i] = kr * r[i] - 2.0 * c_.damping_ratio * std::sqrt(kr * c_.inertia) * w[i];
     }
+    const TaskDynamics dynamics(*arm_, tool, q, load);
+    const Vec3<double> turning = dynamics.turning(Arm::to_vec(T));
+    out.torque = {turning.x, turning.y, turning.z};
     JointVector tau = inverse_dynamics<double>(*arm_, q, dq, JointVector{}, load);
-    const JointVector friction = arm_->friction_torque(dq), posture = posture_.torque(tool, TaskDynamics(*arm_, tool, q, load), q, dq);
+    const JointVector friction = arm_->friction_torque(dq), posture = posture_.torque(tool, dynamics, q, dq);
     for (std::size_t j = 0; j < n; ++j) tau[j] += friction[j] + posture[j];
-    tool.add_wrench(Arm::to_vec(out.force), Arm::to_vec(out.torque), arm_->n(), tau);
+    tool.add_wrench(Arm::to_vec(out.force), turning, arm_->n(), tau);
     if (!check::all_finite(tau, n)) return out;
     out.joints.torque = tau;
     out.joints.status = Status::ok;

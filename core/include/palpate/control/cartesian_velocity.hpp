@@ -96,10 +96,10 @@ struct CartesianCommand {
 /// the goal and comes back to it. (W wanted no speed within 0.02 m and kept pushing by a bias learnt on the way.)
 ///
 /// Pressing (hybrid split, normal_force > 0): velocity in the plane by (b), along the normal n a force,
-///   F_n = -(f_d + k_p (f_d - f) + k_i integral) - (f_d / touch_speed) (v . n),   -F_max <= F_n <= 0,
+///   F_n = -(f_d + k_p (f_d - f) + k_i integral) - (f_d / touch_speed) (v . n),   |F_n| <= F_max,
 /// f the force of the surface on the tool by the sensorless estimate. The last term lets the tool approach a surface it does not
-/// feel at touch_speed, with no more than f_d; nothing is integrated before it is felt. The plane gets what the bound leaves:
-/// sqrt(F_max^2 - F_n^2). Without an estimate that may be believed nothing is pressed and nothing moves (status held).
+/// feel at touch_speed and brakes it if it comes faster; nothing is integrated before the surface is felt. The plane gets what the
+/// bound leaves: sqrt(F_max^2 - F_n^2). Without an estimate that may be believed nothing is pressed and nothing moves (status held).
 ///
 /// A push (external force beyond yield_force, the contact's own force taken away) makes the arm yield: ABAGs and integral are
 /// cleared and F = 0 until it has been gone for yield_time. The tool keeps its orientation.
@@ -288,12 +288,12 @@ class CartesianVelocity {
     return bounded(dynamics.turning(c_.max_torque * u), c_.max_torque);
   }
 
-  /// Along the outward normal, <= 0: a tool presses, it does not pull.
+  /// Along the outward normal: < 0 presses.
   [[nodiscard]] double normal_force(double wanted, double f, double v) noexcept {
     const double error = wanted - f;
     if (f > 0.3 * wanted) integral_ = std::clamp(integral_ + c_.force_i * h_ * error, -0.5 * wanted, 0.5 * wanted);
     const double feedback = f > 0.3 * wanted ? c_.force_p * error : 0.0;
-    return std::clamp(-(wanted + feedback + integral_) - wanted / c_.touch_speed * v, -c_.max_force, 0.0);
+    return std::clamp(-(wanted + feedback + integral_) - wanted / c_.touch_speed * v, -c_.max_force, c_.max_force);
   }
 
   /// Somebody pushes, or did a moment ago. f in task axes.

@@ -18,7 +18,7 @@ inline Vec3<double> bounded(const Vec3<double>& a, double bound) noexcept {
   if (most == 0.0) return a;
   const Vec3<double> unit = (1.0 / most) * a;  // its square cannot overflow
   const double length = std::sqrt(dot(unit, unit));
-  if (most <= bound / length) return a;
+  if (most <= (1.0 - 1e-14) * bound / length) return a;
   Vec3<double> out = (bound / length) * unit;
   while (dot(out, out) > bound * bound) out = (1.0 - 1e-15) * out;  // rounding must not lift it above the bound
   return out;
