@@ -126,6 +126,31 @@ void bind_cartesian(nb::module_& m) {
       }, nb::arg("position"), nb::arg("orientation"), nb::arg("speed"), nb::arg("velocity"), nb::arg("axes"), nb::arg("normal_force"), nb::arg("q"),
            nb::arg("dq"), nb::arg("force").none(), nb::arg("load"),
            "Returns (joint torque, status, force, torque, brake, velocity, wanted velocity, distance, contact force, arrived, yielding).")
+      .def("run", [](PyCartesianVelocity& self, const Vector& position, const Vector& orientation, double speed, double normal_force, const Rows& q, const Rows& dq,
+                     const Rows& force) {
+        const int n = self.arm->n();
+        const std::size_t N = q.shape(0);
+        expect(q.shape(1) == static_cast<std::size_t>(n) && dq.shape(0) == N && dq.shape(1) == q.shape(1) && force.shape(0) == N && force.shape(1) == 3,
+               "expected q and dq (N, " + std::to_string(n) + ") and force (N, 3)");
+        CartesianTarget target{fixed<3>(position, "position"), fixed<9>(orientation, "orientation"), speed};
+        target.normal_force = normal_force;
+        Output<double> torque({N, static_cast<std::size_t>(n)}), wrench({N, 6});
+        unlocked([&] {
+          Wrench external;
+          external.status = Status::ok;
+          for (std::size_t i = 0; i < N; ++i) {
+            for (std::size_t k = 0; k < 3; ++k) external.force[k] = force.data()[3 * i + k];
+            const CartesianCommand c = self.controller.step(target, row(q.data(), i, n), row(dq.data(), i, n), external);
+            for (std::size_t j = 0; j < static_cast<std::size_t>(n); ++j) torque.data[i * static_cast<std::size_t>(n) + j] = c.joints.torque[j];
+            for (std::size_t k = 0; k < 3; ++k) {
+              wrench.data[6 * i + k] = c.force[k];
+              wrench.data[6 * i + 3 + k] = c.torque[k];
+            }
+          }
+        });
+        return nb::make_tuple(torque.array, wrench.array);
+      }, nb::arg("position"), nb::arg("orientation"), nb::arg("speed"), nb::arg("normal_force"), nb::arg("q"), nb::arg("dq"), nb::arg("force"),
+           "One step per row. Returns (joint torque (N, n), force and torque (N, 6)).")
       .def("abag", [](const PyCartesianVelocity& self) {
         return nb::make_tuple(state(self.controller.abag(0)), state(self.controller.abag(1)), state(self.controller.abag(2)));
       }, "(e_bar, b, g, u) of the three task axes; in mode 'heading' the first is the one in use.")
