@@ -23,8 +23,9 @@ struct VelocityErrata {
 /// One set of ABAG parameters each for positions and orientations, bounds, the speed profile, and what a contact may do.
 struct CartesianVelocityConfig {
   VelocityAxes axes = VelocityAxes::per_axis;
-  AbagParameters abag{0.5, 0.0, 0.004, 0.5, 0.008, 0.004, 0.03, 0.3};         ///< of the velocity
-  AbagParameters abag_turning{0.5, 0.0, 0.004, 0.5, 0.008, 0.004, 0.3, 0.3};  ///< of the angular velocity
+  // steady with 8 ms steps and a velocity that is 20 ms late; with less of both it may be made stiffer
+  AbagParameters abag{0.5, 0.0, 0.003, 0.5, 0.008, 0.004, 0.05, 0.3};          ///< of the velocity
+  AbagParameters abag_turning{0.5, 0.0, 0.002, 0.5, 0.008, 0.004, 0.5, 0.1};  ///< of the angular velocity
   double max_force = 5.0;           ///< F_max: ||F|| never exceeds it [N], > 0
   double max_torque = 2.0;          ///< T_max: ||T|| never exceeds it [N m], > 0
   double slow_speed = 0.02;         ///< within slow_zone of the goal [m/s], > 0
@@ -42,7 +43,7 @@ struct CartesianVelocityConfig {
   double free_speed = 0.4;          ///< beyond this, and beyond 1.5 times the wanted speed, the brake acts [m/s], > 0
   double free_turning = 1.0;        ///< [rad/s], > 0
   double brake = 60.0;              ///< force against the speed beyond, against any speed while yielding [N s/m], >= 0; 0: none
-  double brake_turning = 1.0;       ///< torque against the turning beyond [N m s/rad], >= 0
+  double brake_turning = 0.3;       ///< torque against the turning beyond [N m s/rad], >= 0
   PostureConfig posture{};
   VelocityErrata errata{};
 

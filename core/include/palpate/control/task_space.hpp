@@ -118,7 +118,7 @@ struct TaskDynamics {
 
 struct PostureConfig {
   double stiffness = 2.0;      ///< k_n: torque per gradient of the posture's worth [N m], >= 0; 0: only damping
-  double damping = 2.0;        ///< d_n: of motion that does not move the tool [N m s/rad], >= 0
+  double damping = 0.5;        ///< d_n: of motion that does not move the tool [N m s/rad], >= 0
   double limits = 0.2;         ///< worth of the distance to position limits against that to singularities [1], >= 0
   double largest = 5.0;        ///< no joint gets more than this before the projection [N m], > 0
 };
