@@ -92,8 +92,9 @@ def test_reaches_the_goal_in_mujoco_within_its_bounds(arm):
     assert np.linalg.norm(turned - R) < 0.01
     assert run[:, 5].max() <= 5.0
     assert run[:, 6].max() <= 2.0
+    assert run[:, 4].max() < 0.06
     middle = (run[:, 0] > 1.5) & (np.linalg.norm(run[:, 1:4] - goal, axis=1) > 0.1)
-    assert run[middle, 4].mean() == pytest.approx(0.05, abs=0.004)
+    assert run[middle, 4].mean() == pytest.approx(0.05, abs=0.006)
 
 
 def test_a_push_leads_to_yielding_not_to_more_force(arm):

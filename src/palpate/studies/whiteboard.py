@@ -161,7 +161,8 @@ def measure(job: Job) -> Found:
                 )
             )
     table = np.array(rows)
-    return Found(*table[:, :4].T.copy(), table[:, 4:7], table[:, 7:], diverged)
+    now_s, speed, distance, force = table[:, :4].T.copy()
+    return Found(now_s, speed, distance, force, table[:, 4:7], table[:, 7:], diverged)
 
 
 def step_time(repeats: int = 7, rows: int = 4000) -> tuple[float, float]:
@@ -351,7 +352,7 @@ def _time_rows() -> list[Row]:
 
 
 def _draw(line: Mapping[tuple[Form, str], Found], goal: Mapping[Form, Found]) -> dict[str, Figure]:
-    names = {
+    names: dict[str, tuple[Form, str]] = {
         "published": ("published", PLAIN),
         "corrected": ("corrected", PLAIN),
         "palpate": ("palpate", RECOVERED),

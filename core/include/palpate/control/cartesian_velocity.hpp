@@ -25,7 +25,7 @@ struct CartesianVelocityConfig {
   VelocityAxes axes = VelocityAxes::per_axis;
   // steady with steps of 1 to 8 ms and a velocity up to 8 ms late; a mean of 5 at 8 ms (16 ms late) makes the tool tremble
   AbagParameters abag{0.5, 0.0, 0.003, 0.5, 0.008, 0.004, 0.05, 0.3};          ///< of the velocity
-  AbagParameters abag_turning{0.5, 0.0, 0.0008, 0.5, 0.008, 0.004, 0.5, 0.25};  ///< of the angular velocity
+  AbagParameters abag_turning{0.5, 0.0, 0.0008, 1.0, 0.008, 0.004, 0.5, 0.25};  ///< of the angular velocity; its gain does not grow
   double max_force = 5.0;           ///< F_max: ||F|| never exceeds it [N], > 0
   double max_torque = 2.0;          ///< T_max: ||T|| never exceeds it [N m], > 0
   double slow_speed = 0.02;         ///< within slow_zone of the goal [m/s], > 0
