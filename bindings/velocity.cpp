@@ -28,7 +28,7 @@ std::size_t checked(const Times& time, const Rows& position, int n) {
 void bind_velocity(nb::module_& m) {
   using S = SenderClockConfig;
   bind_config<S>(m, "SenderClockOptions", "What is known of a sender and of who reads it.",
-                 {{"period", &S::period, "of the sender [s]; 0: found from the data"},
+                 {{"period", &S::period, "of the sender [s], more than twice stamp_std; 0: found from the data"},
                   {"stamp_std", &S::stamp_std, "jitter of the reader's time stamps [s]"},
                   {"position_std", &S::position_std, "of a position [rad]"},
                   {"acceleration", &S::acceleration, "the least that the speed is thought to change [rad/s^2]; how much it does is learnt"},

@@ -22,7 +22,7 @@ ALLOWED: dict[str, set[str]] = {
     "spatial": {"status", "types", "scalar"},
     "friction": BASE,
     "filter": BASE,
-    "sender_clock": BASE,
+    "sender_clock": BASE | {"filter"},
     "velocity": BASE | {"filter", "sender_clock"},
     "trajectory": BASE,
     "arm": BASE | {"friction"},

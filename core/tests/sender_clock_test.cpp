@@ -258,6 +258,8 @@ TEST(JointVelocity, ConstructorNamesWhatIsWrong) {
     return "nothing thrown";
   };
   EXPECT_EQ(message({.average = 65}), "MovingAverage window [samples] = 65: expected an integer from 1 to 64");
+  EXPECT_EQ(message({.sender = {.period = 0.001}}),
+            "SenderClockConfig period [s] = 0.001: expected more than twice stamp_std, or the stamps tell no cycles apart");
   EXPECT_EQ(message({.sender = {.stamp_std = 0.0}}), "SenderClockConfig stamp_std [s] = 0: expected a finite number > 0");
 }
 

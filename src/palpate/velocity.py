@@ -61,7 +61,7 @@ class SenderClock:
 
     Args:
         n: number of joints.
-        period: of the sender [s]; None: found in the first stretch of motion (48 looks).
+        period: of the sender [s], more than twice stamp_std; None: found in the first stretch of motion (48 looks).
         stamp_std: jitter of the reader's time stamps [s].
         position_std: of a position [rad].
         max_speed: no joint is faster [rad/s]; a position further away ends what came before (status gap).

@@ -9,12 +9,13 @@
 #include <numbers>
 
 #include "palpate/check.hpp"
+#include "palpate/filter.hpp"
 #include "palpate/types.hpp"
 
 namespace palpate {
 
 struct SenderClockConfig {
-  double period = 0.0;         ///< of the sender [s]; 0: found from the data
+  double period = 0.0;         ///< of the sender [s], more than twice stamp_std; 0: found from the data
   double stamp_std = 5e-4;     ///< jitter of the reader's time stamps [s], > 0
   double position_std = 2e-5;  ///< of a position [rad], > 0
   double acceleration = 0.1;   ///< the least that the speed is thought to change [rad/s^2], > 0; how much it does is learnt
@@ -52,6 +53,8 @@ class SenderClock {
       : n_(static_cast<std::size_t>(check::in_range("SenderClock n", n, 1, max_joints))), c_(config) {
     check::not_negative("SenderClockConfig period [s]", config.period);
     check::positive("SenderClockConfig stamp_std [s]", config.stamp_std);
+    if (config.period > 0.0 && config.period <= 2.0 * config.stamp_std)
+      check::fail("SenderClockConfig period [s]", config.period, "more than twice stamp_std, or the stamps tell no cycles apart");
     check::positive("SenderClockConfig position_std [rad]", config.position_std);
     check::positive("SenderClockConfig acceleration [rad/s^2]", config.acceleration);
     check::positive("SenderClockConfig max_speed [rad/s]", config.max_speed);
@@ -64,7 +67,7 @@ class SenderClock {
     out_.fresh = false;
     if (!check::all_finite(q, n_)) return refused(Status::non_finite);
     if (mode_ != Mode::empty && time_ns <= read_ns_) return refused(Status::time_error);
-    const double dt = mode_ == Mode::empty ? 0.0 : static_cast<double>(time_ns - read_ns_) * 1e-9;
+    const double dt = mode_ == Mode::empty ? 0.0 : seconds_between(read_ns_, time_ns);
     JointVector x{};
     double moved = 0.0;
     bool jump = false;
@@ -158,6 +161,7 @@ class SenderClock {
     std::array<std::uint8_t, window> m{};
     if (c_.period > 0.0) {
       const double ratio = length / window / c_.period;
+      if (ratio >= 200.0) return;
       assign(static_cast<int>(ratio), m);
     } else if (repeats > window / 20 && repeats + moving > window - 2) {  // the reader is the faster one
       assign(0, m);
@@ -238,7 +242,7 @@ class SenderClock {
     const double rate = tk / tt;
     double scatter = 0.0;
     for (std::size_t i = 0; i < window; ++i) scatter += (K[i] - sk - rate * (T[i] - st)) * (K[i] - sk - rate * (T[i] - st));
-    if (!(rate > 0.0) || scatter > 0.25 * window) return;  // no clock counts like this
+    if (!(rate > 0.0) || scatter > 0.25 * window || 2.0 * c_.stamp_std * rate >= 1.0) return;  // no clock, or none that the stamps show
     const double age = T[window - 1] - st;
     rate_ = c_.period > 0.0 ? 1.0 / c_.period : rate;
     phase_ = std::clamp(sk + 0.5 + rate_ * age - K[window - 1], 0.0, 1.0);
