@@ -14,7 +14,10 @@
 #include <variant>
 #include <vector>
 
+#include "palpate/control/cartesian_impedance.hpp"
+#include "palpate/control/cartesian_velocity.hpp"
 #include "palpate/pipeline.hpp"
+#include "palpate/velocity.hpp"
 
 namespace nb = nanobind;
 
@@ -83,6 +86,14 @@ struct Names<palpate::Point> {
   static constexpr std::array<const char*, 2> values{"grasp", "tip"};
 };
 template <>
+struct Names<palpate::Lag> {
+  static constexpr std::array<const char*, 2> values{"exact", "published"};
+};
+template <>
+struct Names<palpate::VelocityAxes> {
+  static constexpr std::array<const char*, 2> values{"heading", "per_axis"};
+};
+template <>
 struct Names<palpate::ContactSource> {
   static constexpr std::array<const char*, 2> values{"momentum", "model_residual"};
 };
@@ -92,7 +103,8 @@ template <class C>
 struct Option {
   const char* name;
   std::variant<double C::*, int C::*, bool C::*, palpate::Solver C::*, palpate::Axes C::*, palpate::Point C::*, palpate::ContactSource C::*,
-               std::array<double, 3> C::*, palpate::JointVector C::*>
+               palpate::Lag C::*, palpate::VelocityAxes C::*, palpate::AbagParameters C::*, palpate::PostureConfig C::*, palpate::VelocityErrata C::*,
+               palpate::SenderClockConfig C::*, std::array<double, 3> C::*, palpate::JointVector C::*>
       member;
   const char* doc;
 };
@@ -100,7 +112,7 @@ struct Option {
 /// Binds configuration C as a Python class with keyword-only arguments, read-only properties, options() and repr.
 /// An unknown keyword is an error that lists the known ones; ranges are checked when a pipeline is built.
 template <class C>
-void bind_config(nb::module_& m, const char* name, const char* doc, std::vector<Option<C>> options) {
+nb::class_<C> bind_config(nb::module_& m, const char* name, const char* doc, std::vector<Option<C>> options) {
   std::string text = std::string(doc) + "\n\nKeyword arguments:";
   const C defaults{};
   for (const auto& option : options) text += std::string("\n    ") + option.name + ": " + option.doc;
@@ -184,11 +196,14 @@ void bind_config(nb::module_& m, const char* name, const char* doc, std::vector<
     return out + ")";
   });
   (void)defaults;
+  return type;
 }
 
 void bind_arm(nb::module_& m);
 void bind_pipeline(nb::module_& m);
 void bind_control(nb::module_& m);
 void bind_phase(nb::module_& m);
+void bind_cartesian(nb::module_& m);
+void bind_velocity(nb::module_& m);
 
 }  // namespace palpate_py

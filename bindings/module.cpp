@@ -10,4 +10,6 @@ NB_MODULE(_core, m) {
   palpate_py::bind_pipeline(m);
   palpate_py::bind_control(m);
   palpate_py::bind_phase(m);
+  palpate_py::bind_cartesian(m);
+  palpate_py::bind_velocity(m);
 }

@@ -22,6 +22,8 @@ ALLOWED: dict[str, set[str]] = {
     "spatial": {"status", "types", "scalar"},
     "friction": BASE,
     "filter": BASE,
+    "sender_clock": BASE | {"filter"},
+    "velocity": BASE | {"filter", "sender_clock"},
     "trajectory": BASE,
     "arm": BASE | {"friction"},
     "chain": BASE | {"friction", "arm"},

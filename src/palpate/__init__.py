@@ -6,6 +6,9 @@ from types import ModuleType
 
 from . import robots
 from ._core import (
+    AbagParameters,
+    CartesianImpedanceOptions,
+    CartesianVelocityOptions,
     Conditioner,
     ContactDetector,
     DisturbanceKalman,
@@ -17,14 +20,28 @@ from ._core import (
     MomentumObserver,
     MomentumSuperTwisting,
     PayloadFilter,
+    Posture,
     Regression,
+    SenderClockOptions,
     SlidingModeObserver,
     Status,
+    VelocityErrata,
     WrenchEstimator,
     __version__,
 )
 from .arm import Arm, Effort, Friction, Joint, Limits, Sensing, Shape
-from .control import Controller, Quintic, SafetyLimiter, Setpoint
+from .control import (
+    Abag,
+    AbagState,
+    CartesianCommand,
+    CartesianImpedance,
+    CartesianTarget,
+    CartesianVelocity,
+    Controller,
+    Quintic,
+    SafetyLimiter,
+    Setpoint,
+)
 from .errors import ArmError, DriverError, InputError, LogError, MissingExtraError, PalpateError
 from .logs import ColumnMap, Log, Recorder
 from .phase import PhaseCurrents, PhaseTorque
@@ -42,10 +59,20 @@ from .pipeline import (
     status_names,
     tare,
 )
+from .velocity import JointVelocity, SenderClock, SenderStamp, SenderStamps
 
 __all__ = [
+    "Abag",
+    "AbagParameters",
+    "AbagState",
     "Arm",
     "ArmError",
+    "CartesianCommand",
+    "CartesianImpedance",
+    "CartesianImpedanceOptions",
+    "CartesianTarget",
+    "CartesianVelocity",
+    "CartesianVelocityOptions",
     "ColumnMap",
     "Conditioner",
     "Contact",
@@ -64,6 +91,7 @@ __all__ = [
     "InverseDynamicsObserver",
     "Joint",
     "JointFormula",
+    "JointVelocity",
     "Limits",
     "Log",
     "LogError",
@@ -77,10 +105,15 @@ __all__ = [
     "PhaseCurrents",
     "PhaseTorque",
     "Pipeline",
+    "Posture",
     "Quintic",
     "Recorder",
     "Regression",
     "SafetyLimiter",
+    "SenderClock",
+    "SenderClockOptions",
+    "SenderStamp",
+    "SenderStamps",
     "Sensing",
     "Setpoint",
     "Shape",
@@ -88,6 +121,7 @@ __all__ = [
     "Status",
     "Tare",
     "Touch",
+    "VelocityErrata",
     "Wrench",
     "WrenchEstimator",
     "__version__",

@@ -573,6 +573,19 @@ class TestScenes:
         assert plant.truth().external.shape == (7,)
         assert plant.data.body("ball").xpos[2] < 0.0
 
+    def test_a_held_object_touches_with_its_whole_size(self) -> None:
+        """MuJoCo looks for contacts within a box around the shape, which has to grow with the object."""
+        arm = robots.load("kuka_lbr_iiwa7")
+        height = float(Plant(arm).pose("grasp")[2, 3])
+
+        def block(spec: Any) -> None:
+            spec.worldbody.add_geom(name="block", type=6, size=(0.02, 0.02, 0.02), pos=(0.0, 0.19, height))
+
+        plant = Plant(arm, contacts=True, scene=block)
+        plant.attach(Load.box(0.5, (0.1, 0.4, 0.1)))
+        plant.step(np.zeros(7), PERIOD)
+        assert plant.data.ncon > 0
+
     def test_extrapolation_through_contacts_is_refused(self) -> None:
         with pytest.raises(InputError, match="contacts"):
             Plant(robots.load("kuka_lbr_iiwa7"), contacts=True, integrator="extrapolated")

@@ -345,6 +345,12 @@ class Plant:
         model.geom_pos[geom] = model.body_ipos[self._built.payload]
         model.geom_size[geom] = _model.box_halves(load.mass, load.size)
         model.geom_rbound[geom] = float(np.linalg.norm(model.geom_size[geom]))
+        model.geom_aabb[geom] = (
+            0.0,
+            0.0,
+            0.0,
+            *model.geom_size[geom],
+        )  # contacts outside of it are not looked for
         model.geom_rgba[geom] = _model.PAYLOAD_COLOUR
 
     def release(self) -> None:

@@ -91,6 +91,10 @@ _ALL = (
     Study("mass-estimation", "The published mass estimation with a sliding-mode observer", "reproduce"),
     Study("lara8", "A real NEURA LARA8 weighs 5.26 kg by its motor currents", "reproduce"),
     Study("sensorless-force", "External force of an ABB IRB 2400 from its phase currents alone", "reproduce"),
+    Study("iiwa-velocity", "The velocity noise of a real KUKA LBR iiwa is two clocks", "reproduce"),
+    Study(
+        "whiteboard", "The whiteboard project's velocity controllers, as published and corrected", "reproduce"
+    ),
     Study("payload-filter", "The payload Kalman filter on the published bench", "bench"),
     Study("unknown-grasp", "The object is not held where it was thought", "bench"),
     Study("wrong-masses", "The arm's links do not weigh what the model says", "bench"),
