@@ -177,8 +177,8 @@ def _board(
     w, h = size
     kind = str(rng.choice(["aluminium", "thin", "wood", "white", "none"], p=[0.5, 0.15, 0.12, 0.13, 0.1]))
     width = {"aluminium": rng.uniform(15, 75), "thin": rng.uniform(7, 16), "wood": rng.uniform(25, 80),
-             "white": rng.uniform(20, 60), "none": 0.0}[kind]
-    f = round(width)
+             "white": rng.uniform(20, 60), "none": 4.0}[kind]
+    f = round(min(width, 0.07 * min(w, h)))
     margin = 40
     o = f + margin
     texture = np.ones((h + 2 * o, w + 2 * o, 3), np.float32) * surface.astype(np.float32)
@@ -186,8 +186,7 @@ def _board(
     outer = (slice(margin, h + 2 * f + margin), slice(margin, w + 2 * f + margin))
     alpha[outer] = 1.0
     inside = (slice(o, o + h), slice(o, o + w))
-    if f:
-        _frame(rng, texture, kind, f, margin, surface)
+    _frame(rng, texture, kind, f, margin, surface)
     face = texture[inside]
     face[:] = surface * (1.0 + 0.01 * _smooth(rng, (h, w), 5)[..., None])
     marks = np.zeros((h, w), np.uint8)
@@ -197,11 +196,11 @@ def _board(
         _write(rng, face, marks)
     spoiled |= marks
     _magnets(rng, face, marks, spoiled)
-    if f and rng.random() < 0.4:  # the frame throws a soft shadow on the surface
+    if kind != "none" and rng.random() < 0.4:  # the frame throws a soft shadow on the surface
         depth = rng.uniform(4, 18)
         y = np.arange(h, dtype=np.float32)[:, None, None] / depth
         face *= 1.0 - rng.uniform(0.05, 0.25) * np.exp(-(y**2))
-    if f and kind != "none" and rng.random() < 0.5:
+    if kind != "none" and rng.random() < 0.5:
         _caps(rng, texture, alpha, f, margin)
     whole = np.zeros(alpha.shape, np.uint8)
     dirt = np.zeros(alpha.shape, np.uint8)
@@ -219,13 +218,15 @@ def _frame(rng: np.random.Generator, texture: Float, kind: str, f: int, margin: 
         "thin": rng.choice(np.array([30.0, 90.0, 150.0])) * np.ones(3),
         "wood": np.array([rng.uniform(40, 90), rng.uniform(80, 130), rng.uniform(120, 180)]),
         "white": surface * rng.uniform(0.93, 1.1),
+        "none": surface * rng.choice([0.6, 0.75, 1.15]),  # a panel shows its own thickness
     }[kind]
     s = np.linspace(0.0, 1.0, f, dtype=np.float32)
+    grooved = kind != "none" and rng.random() < 0.95
     for side in range(4):
         profile = 1.0 + rng.uniform(0.0, 0.25) * np.sin(math.pi * s) * rng.choice([-1, 1])
         if kind == "aluminium":
             profile += 0.25 * np.exp(-(((s - rng.uniform(0.2, 0.8)) / 0.12) ** 2)).astype(np.float32)
-        if rng.random() < 0.8:  # the groove where frame and surface meet
+        if grooved:  # where frame and surface meet
             profile[-max(1, f // 8) :] *= rng.uniform(0.5, 0.9)
         if rng.random() < 0.8:
             profile[: max(1, f // 10)] *= rng.uniform(0.5, 0.95)

@@ -11,12 +11,18 @@ from ..arm import Array
 from ._image import Float, Image
 from ._quads import homographies, mapped
 
-ALONG = 96
+ALONG = 60
 """samples along a side"""
 PIECES = 12
 """a side is looked at in so many pieces"""
-OUTWARD, INWARD = 0.04, 0.16
+OUTWARD, INWARD = 0.03, 0.11
 """how far from the rough side the surface's edge is looked for, relative to the board"""
+ROWS = 110
+"""steps looked at across a side"""
+FAINT = 0.12
+"""an edge is at least so strong, relative to the strongest along its side"""
+GAP = 0.04
+"""a frame shows an edge at least every so often, relative to the board"""
 MOST = 0.6
 """part of the pieces in which an edge must be seen"""
 
@@ -33,117 +39,211 @@ class Edges:
     """(4,) deviation of the edge points from the fitted line [pixels]"""
 
 
-def fit(grey: Image, corners: Array, border: Array) -> Edges:
+def fit(image: Image, corners: Array, border: Array) -> Edges:
     """Find the inner edges and fit lines to them.
 
     Args:
-        grey: (H, W).
+        image: (H, W, 3).
         corners: (4, 2) rough, clockwise.
         border: (4,) bool: this side is the picture's border and stays.
     """
-    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
-    inner = _inner(smooth, corners, border)
-    found = _fitted(smooth, inner, border, 5.0)
-    return _fitted(smooth, found.corners, border, 3.0)
+    return _fitted(image, _inner(image, corners, border), border, 3.5)
 
 
-def strip(grey: Image, corners: Array, side: int, low: float, high: float, count: int) -> tuple[Float, Array, float]:
-    """The picture along one side: rows from outside to inside.
+def _sampled(image: Image, points: Array) -> Float:
+    """The picture (H, W, 3) at points (R, C, 2), between pixels linearly: (R, C, 3)."""
+    at = points.astype(np.float32)
+    return cv2.remap(image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
 
-    Args:
-        grey: (H, W).
-        corners: (4, 2).
-        side: from corner `side` to the next.
-        low, high: first and last row, relative to the board's extent across the side; negative: outside.
-        count: rows.
+
+@dataclass(frozen=True, slots=True)
+class _Steps:
+    """Edges along a whole side, from outside to inside, as fractions of the board's extent across the side."""
+
+    begin: Array
+    """(M,) distance from the rough side at its first corner"""
+    end: Array
+    """(M,) at its second corner"""
+
+    @property
+    def middle(self) -> Array:
+        return 0.5 * (self.begin + self.end)
+
+
+def _inner(image: Image, corners: Array, border: Array) -> Array:
+    """The quadrangle of the innermost edges near the rough one."""
+    found = _steps(image, corners)
+    lines = np.zeros((4, 3))
+    for side, steps in enumerate(found):
+        i = None if border[side] else _innermost(steps, None if border[side - 2] else found[side - 2])
+        v = (0.0, 0.0) if i is None else (steps.begin[i], steps.end[i])
+        p, q = mapped(homographies(np.roll(corners, -side, 0)[None]), np.array([[0.0, v[0]], [1.0, v[1]]]))[0]
+        lines[side] = *_normal(p, q), _normal(p, q) @ p
+    return _met(lines)
+
+
+def _normal(p: Array, q: Array) -> Array:
+    """Unit normal of the line from p to q, to the right in a picture whose y points down."""
+    along = (q - p) / np.linalg.norm(q - p)
+    return np.array([-along[1], along[0]])
+
+
+def _met(lines: Array) -> Array:
+    """Corners of four lines (n_x, n_y, c) in turn: corner k where sides k-1 and k meet."""
+    return np.array([np.linalg.solve(lines[[k - 1, k], :2], lines[[k - 1, k], 2]) for k in range(4)])
+
+
+def _steps(image: Image, corners: Array) -> list[_Steps]:
+    """Where edges run along the four sides."""
+    u = np.linspace(0.04, 0.96, ALONG)
+    v = np.linspace(-OUTWARD, INWARD, ROWS + 2)
+    grid = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+    around = np.stack([np.roll(corners, -side, 0) for side in range(4)])
+    points = mapped(homographies(around), grid).reshape(4, ROWS + 2, ALONG, 2)
+    level = np.stack([cv2.blur(_sampled(image, p), (1, 3)) for p in points])
+    step = level[:, 2:] - level[:, :-2]
+    # per piece the median over its columns: a stroke or a magnet covers few of them
+    pieces = np.sort(step.reshape(4, ROWS, PIECES, -1, 3), 3)[:, :, :, ALONG // PIECES // 2]
+    noise = 1.4826 * np.median(np.abs(pieces[:, -ROWS // 3 :]), axis=(1, 2, 3))  # mostly surface
+    threshold = np.tile(np.clip(4.0 * noise, 2.5, 8.0), 2)[:, None]
+    signed = np.concatenate([pieces, -pieces])
+    size = np.maximum(np.maximum(signed[..., 0], signed[..., 1]), np.maximum(signed[..., 2], 0.0))
+    path, total = _paths(np.minimum(size / threshold[:, :, None], 3.0))
+    sizes = np.take_along_axis(size, path, 1)
+    strength = np.median(sizes, 2)
+    clear = ((sizes > threshold[:, :, None]).mean(2) >= MOST) & (strength > threshold)
+    strongest = np.where(clear, strength, 0.0).reshape(2, 4, ROWS).max((0, 2))
+    clear &= strength > FAINT * np.tile(strongest, 2)[:, None]
+    padded = np.pad(total, ((0, 0), (3, 3)))
+    clear &= total >= np.max([padded[:, k : k + ROWS] for k in range(7)], 0)
+    along = (np.arange(PIECES) + 0.5) / PIECES * 0.92 - 0.46
+    found = []
+    for side in range(4):
+        which, row = np.nonzero(clear[side::4])
+        which = which * 4 + side
+        weight, at = np.minimum(sizes[which, row], threshold[side]) + 1e-3, path[which, row] + 1.0
+        whole = weight.sum(1)
+        mean, centre = (weight * at).sum(1) / whole, (weight * along).sum(1) / whole
+        off = along - centre[:, None]
+        slope = (weight * off * at).sum(1) / (weight * off**2).sum(1)
+        mean -= slope * centre
+        ends = np.stack([mean - 0.5 * slope, mean + 0.5 * slope], 1)
+        kept: list[int] = []
+        for i in np.argsort(-strength[which, row], kind="stable"):  # one edge, one entry
+            if not kept or np.abs(ends[kept] - ends[i]).max(1).min() > 2.5:
+                kept.append(int(i))
+        kept.sort(key=lambda i: ends[i].sum())
+        place = v[0] + (v[1] - v[0]) * ends[kept]
+        found.append(_Steps(place[:, 0], place[:, 1]))
+    return found
+
+
+def _paths(weight: Array) -> tuple[Array, Array]:
+    """Best ways along strips (S, rows, pieces) through every row of the middle piece, moving by one row at most.
 
     Returns:
-        brightness (count, ALONG); the points (count, ALONG, 2); pixels per row.
+        rows of the way (S, rows, pieces) and its sum of weights (S, rows).
     """
-    H = homographies(np.roll(corners, -side, 0)[None])
-    u = np.linspace(0.04, 0.96, ALONG)
-    v = np.linspace(low, high, count)
-    points = mapped(H, np.stack(np.meshgrid(u, v), -1).reshape(-1, 2))[0].reshape(count, ALONG, 2)
-    level = cv2.remap(grey, points.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    step = float(np.linalg.norm(points[-1] - points[0], axis=1).mean()) / (count - 1)
-    return level.astype(np.float32), points, step
+    strips, rows, pieces = weight.shape
+    start = pieces // 2
+    path = np.empty(weight.shape, np.int64)
+    total = weight[:, :, start].copy()
+    path[:, :, start] = np.arange(rows)
+    padded = np.full((strips, rows + 2), -1.0)
+    for order in (range(start + 1, pieces), range(start - 1, -1, -1)):
+        best = np.zeros((strips, rows))
+        moves = []
+        for k in reversed(order):  # from the end towards the middle: the best way from every row on
+            padded[:, 1:-1] = best + weight[:, :, k]
+            here, up, down = padded[:, 1:-1], padded[:, :-2], padded[:, 2:]
+            best = np.maximum(np.maximum(here, up), down)
+            moves.append(np.where(here >= best, 0, np.where(up >= best, -1, 1)))
+        total += best
+        row = np.tile(np.arange(rows), (strips, 1))
+        for k, move in zip(order, reversed(moves), strict=True):
+            row = row + np.take_along_axis(move, row, 1)
+            path[:, :, k] = row
+    return path, total
 
 
-def _inner(grey: Image, corners: Array, border: Array) -> Array:
-    """The quadrangle of the innermost edges near the rough one."""
-    moved = np.zeros(4)
-    for side in range(4):
-        if border[side]:
-            continue
-        a, b, c, d = np.roll(corners, -side, 0)
-        across = 0.5 * (np.linalg.norm(d - a) + np.linalg.norm(c - b))
-        rows = int(np.clip((INWARD + OUTWARD) * across, 24, 160))
-        level, _, _ = strip(grey, corners, side, -OUTWARD, INWARD, rows)
-        at = _innermost(level, OUTWARD / (INWARD + OUTWARD) * (rows - 1))
-        moved[side] = -OUTWARD + (INWARD + OUTWARD) * at / (rows - 1)
-    u = np.array([[moved[3], moved[0]], [1 - moved[1], moved[0]], [1 - moved[1], 1 - moved[2]], [moved[3], 1 - moved[2]]])
-    return mapped(homographies(corners[None]), u)[0]
+def _innermost(steps: _Steps, opposite: _Steps | None) -> int | None:
+    """Which of the edges along a side bounds the writing surface.
+
+    The innermost one, unless a wide even strip lies outside of it: then it is the edge of a shadow or a reflection, or
+    the frame is that wide, and then the opposite side has it too.
+    """
+    place = steps.middle
+    for n in range(len(place) - 1, -1, -1):
+        if n == 0 or place[n] - place[n - 1] < GAP:
+            return n
+        if opposite is not None and np.any(np.abs(opposite.middle - place[n]) < 0.2 * abs(place[n]) + 0.004):
+            return n
+    return None
 
 
-def _innermost(level: Float, start: float) -> float:
-    """Row of the writing surface's edge in a strip (rows, ALONG), from outside to inside; `start`: the rough one."""
-    rows = len(level)
-    step = np.zeros_like(level)
-    step[1:-1] = level[2:] - level[:-2]
-    # per piece the median over its columns: a stroke or a magnet covers few of them
-    pieces = np.median(step.reshape(rows, PIECES, -1), 2)
-    noise = 1.4826 * np.median(np.abs(pieces)) if rows > 8 else 0.0
-    threshold = max(4.0, 4.0 * float(noise))
-    # an edge may slant by a row or two within the strip
-    wide = cv2.dilate(np.abs(pieces).astype(np.float32), np.ones((3, 1), np.uint8))
-    share = (wide > threshold).mean(1)
-    strength = np.median(wide, 1)
-    peak = strength >= cv2.dilate(strength, np.ones((5, 1), np.uint8)).ravel() - 1e-6
-    near = slice(max(0, int(start) - 4), int(start) + 5)
-    reference = max(float(strength[near].max()), 0.5 * float(strength.max()))
-    edges = np.flatnonzero(peak & (share >= MOST) & (strength > 0.25 * reference))
-    if not len(edges):
-        return start
-    return float(edges.max())
-
-
-def _fitted(grey: Image, corners: Array, border: Array, reach: float) -> Edges:
+def _fitted(image: Image, corners: Array, border: Array, reach: float) -> Edges:
     """Lines through the strongest step within `reach` pixels of each side."""
     lines = np.zeros((4, 3))
     seen, spread = np.ones(4), np.zeros(4)
     for side in range(4):
         p, q = corners[side], corners[(side + 1) % 4]
-        direction = (q - p) / np.linalg.norm(q - p)
-        inward = np.array([-direction[1], direction[0]])
+        inward = _normal(p, q)
         lines[side] = *inward, inward @ p
         if border[side]:
             continue
         t = np.linspace(0.04, 0.96, ALONG)
         v = np.arange(-reach - 1.5, reach + 1.6, 0.5)
         points = (p + t[:, None] * (q - p))[None] + v[:, None, None] * inward
-        level = cv2.remap(
-            grey, points.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        ).astype(np.float32)
+        level = cv2.blur(_sampled(image, points), (3, 3))
         step = level[2:] - level[:-2]
-        sign = np.sign(np.median(step[np.abs(np.median(step, 1)).argmax()]))
-        score = step * sign
+        v = v[1:-1]
+        line = _rough_line(step, t, v)
+        if line is None:
+            seen[side] = 0.0
+            continue
+        (a, b), colour = line
+        step = step @ colour
+        score = np.where(np.abs(v[:, None] - (a + b * t)) <= 1.6, step, -np.inf)
         best = score[1:-1].argmax(0) + 1
         columns = np.arange(ALONG)
-        middle, before, after = (score[best + k, columns] for k in (0, -1, 1))
+        middle, before, after = (step[best + k, columns] for k in (0, -1, 1))
         bend = before - 2.0 * middle + after
         shift = np.where(bend < -1e-3, 0.5 * (before - after) / np.where(bend < -1e-3, bend, -1.0), 0.0)
-        at = v[1:-1][best] + 0.5 * np.clip(shift, -1, 1)
+        at = v[best] + 0.5 * np.clip(shift, -1, 1)
         good = middle > max(3.0, 0.3 * float(np.median(middle)))
         seen[side] = good.mean()
         if good.sum() < 8:
             continue
         a, b, spread[side] = _robust(t[good], at[good])
-        ends = np.array([p + (a + b * 0.0) * inward, q + (a + b) * inward])
-        direction = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-        normal = np.array([-direction[1], direction[0]])
-        lines[side] = *normal, normal @ ends[0]
-    met = np.array([np.linalg.solve(lines[[k - 1, k], :2], lines[[k - 1, k], 2]) for k in range(4)])
-    return Edges(met, seen, spread)
+        begin, end = p + a * inward, q + (a + b) * inward
+        normal = _normal(begin, end)
+        lines[side] = *normal, normal @ begin
+    return Edges(_met(lines), seen, spread)
+
+
+def _rough_line(step: Float, t: Array, v: Array) -> tuple[tuple[float, float], Array] | None:
+    """The edge nearest to the middle in steps (rows, ALONG, 3) at distances v.
+
+    Returns:
+        a and b of v = a + b t, and the unit colour (3,) along which the picture gets brighter there, towards the inside;
+        None: no edge.
+    """
+    pieces = np.median(step.reshape(len(v), PIECES, -1, 3), 2)
+    size = np.abs(pieces).max(2)
+    typical = float(np.median(size.max(0)))
+    if typical < 2.0:
+        return None
+    peak = (size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:]) & (size[1:-1] > max(2.0, 0.15 * typical))
+    row = 1 + np.where(peak, np.abs(v[1:-1, None] - 0.3), np.inf).argmin(0)
+    usable = np.flatnonzero(peak.any(0))
+    if len(usable) < 4:
+        return None
+    middle = t.reshape(PIECES, -1).mean(1)[usable]
+    row = row[usable]
+    a, b, _ = _robust(middle, v[row])
+    colour = np.median(pieces[row, usable][np.abs(v[row] - a - b * middle) < 1.5], 0)
+    length = float(np.linalg.norm(colour))
+    return ((a, b), colour / length) if length > 0.5 else None
 
 
 def _robust(t: Array, y: Array) -> tuple[float, float, float]:

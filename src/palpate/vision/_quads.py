@@ -21,9 +21,9 @@ CORNER = 12.0
 """how far around a corner its sides are looked at [pixels]"""
 OUT_OF_VIEW = 0.5
 """support that the picture's border is taken to give a side"""
-SHORTLIST = 240
+SHORTLIST = 160
 """quadrangles looked at more closely"""
-GRID = 16
+GRID = 12
 """points per direction at which the inside is looked at"""
 LEAST_SINE = 0.42
 """of the angle between neighbouring sides"""
@@ -213,9 +213,9 @@ def mapped(H: Array, points: Array) -> Array:
 def picked(channel: Image | Float, points: Array) -> Array:
     """The nearest pixels of a one-channel picture at points (..., 2)."""
     height, width = channel.shape
-    x = np.clip(np.rint(points[..., 0]), 0, width - 1).astype(np.int64)
-    y = np.clip(np.rint(points[..., 1]), 0, height - 1).astype(np.int64)
-    return channel.ravel()[y * width + x].astype(np.float64)
+    x = np.clip(points[..., 0] + 0.5, 0, width - 1).astype(np.int32)
+    y = np.clip(points[..., 1] + 0.5, 0, height - 1).astype(np.int32)
+    return channel[y, x].astype(np.float32)
 
 
 def _inside(corners: Array, image: Image, grey: Image, gradient: Gradient) -> tuple[Array, Array, Array, Array]:
@@ -229,10 +229,11 @@ def _inside(corners: Array, image: Image, grey: Image, gradient: Gradient) -> tu
     usable = flat + 1e-3
     # a plane of brightness, fitted twice: the second time without what is off
     basis = np.column_stack([np.ones(len(grid)), grid - 0.5])
+    squares = (basis[:, :, None] * basis[:, None]).reshape(-1, 9)
     weight = usable
     for _ in range(2):
-        normal = np.einsum("km,mi,mj->kij", weight, basis, basis) + 1e-6 * np.eye(3)
-        right = np.einsum("km,mi,km->ki", weight, basis, level)
+        normal = (weight @ squares).reshape(-1, 3, 3) + 1e-6 * np.eye(3)
+        right = (weight * level) @ basis
         plane = np.linalg.solve(normal, right[..., None])[..., 0] @ basis.T
         off = np.abs(level - plane)
         weight = usable * (off < np.maximum(12.0, 0.12 * plane))
@@ -240,8 +241,8 @@ def _inside(corners: Array, image: Image, grey: Image, gradient: Gradient) -> tu
     surface = weight > 0.5
     count = np.maximum(surface.sum(1), 1)
     bright = (level * surface).sum(1) / count / max(float(np.percentile(grey[::4, ::4], 98)), 1.0)
-    high, low = image.max(2), image.min(2)
-    top, bottom = picked(high, at), picked(low, at)
+    blue, green, red = (picked(image[..., c], at) for c in range(3))
+    top, bottom = np.maximum(np.maximum(blue, green), red), np.minimum(np.minimum(blue, green), red)
     colour = ((1.0 - bottom / np.maximum(top, 1.0)) * surface).sum(1) / count
     return flat.mean(1), even, bright, colour
 
