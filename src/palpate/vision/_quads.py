@@ -54,8 +54,8 @@ FEATURES = (
     "size",  # log of the area
     "contrast",  # other brightness outside than inside, mean over sides
 )
-WEIGHTS = np.array([6.0, 3.0, 2.0, 4.0, 4.0, 2.0, -4.0, 1.0, 1.0])
-BIAS = -14.0
+WEIGHTS = np.array([7.5, 5.4, 4.6, 0.8, 2.5, 3.1, -4.2, 1.2, 2.0])
+BIAS = -17.9
 
 
 def find(lines: Lines, gradient: Gradient, image: Image, grey: Image) -> Quads:
