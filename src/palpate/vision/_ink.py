@@ -29,6 +29,10 @@ SIGMAS = 5.0
 """and by so many standard deviations of the noise"""
 BELOW = 0.03
 """ink is darker than the surface usually is nearby by this part"""
+RIM = 0.025
+"""what touches the border and stays within this, relative to the board's shorter side, belongs to the frame"""
+THING = 0.016
+"""half width from which a filled piece is a thing rather than a stroke, relative to the board's shorter side"""
 SPECK = 9
 """smallest connected piece [pixels]"""
 
@@ -64,7 +68,7 @@ def find(image: Image, corners: Array) -> Ink:
     closed = cv2.morphologyEx(board, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
     taken = _largest(cv2.divide(cv2.subtract(closed, board), closed, scale=255.0))
     below = _largest(cv2.divide(cv2.subtract(_level(board, inside), board), closed, scale=255.0))
-    surface = taken[inside > 0]
+    surface = taken[::3, ::3][inside[::3, ::3] > 0]
     if not surface.size:
         return Ink(np.zeros((height, width), bool), (), (), np.zeros(0))
     # the noise: half of a clean surface takes away less than the median, without strokes
@@ -73,7 +77,7 @@ def find(image: Image, corners: Array) -> Ink:
     faint = max(255.0 * FAINT, middle + SIGMAS * noise)
     clear = max(255.0 * CLEAR, middle + 1.6 * SIGMAS * noise)
     weak = ((taken > faint) & (below > 255.0 * BELOW) & (inside > 0)).astype(np.uint8)
-    return _pieces(weak, taken, clear, low, (height, width), size)
+    return _pieces(weak, taken, clear, corners - low, low, (height, width), shorter, edge / 2.0)
 
 
 def _shape(corners: Array) -> float:
@@ -105,35 +109,62 @@ def _level(board: Image, inside: Image) -> Image:
     return cv2.resize(wide, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def _pieces(weak: Image, taken: Image, clear: float, low: Array, shape: tuple[int, int], size: int) -> Ink:
+def _pieces(
+    weak: Image, taken: Image, clear: float, corners: Array, low: Array, shape: tuple[int, int], shorter: float, margin: float
+) -> Ink:
     """Connected pieces that are clear somewhere, sorted into ink and other things."""
-    count, label, stats, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
     mask = np.zeros(shape, bool)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
+    if count == 1:
+        return Ink(mask, (), (), np.zeros(0))
+    points = cv2.findNonZero(weak).reshape(-1, 2)
+    names = label[points[:, 1], points[:, 0]]
+    order = np.argsort(names, kind="stable")  # the points, piece by piece
+    points = points[order]
+    begin = np.append(0, np.cumsum(stats[1:, cv2.CC_STAT_AREA]))[:-1]
+    xs, ys = points[:, 0], points[:, 1]
+    values = taken[ys, xs].astype(np.float32)
+    core = values > clear
+    hits = np.add.reduceat(core.astype(np.float32), begin)
+    strength = np.add.reduceat(values * core, begin) / np.maximum(hits, 1.0) / 255.0
+    area = stats[1:, cv2.CC_STAT_AREA].astype(np.float64)
+    # of the largest disc within a piece
+    radius = np.maximum.reduceat(cv2.distanceTransform(weak, cv2.DIST_L2, 3)[ys, xs], begin)
+    inward = np.full(len(points), np.inf, np.float32)
+    for p, q in zip(corners, np.roll(corners, -1, 0), strict=True):
+        n = np.array([p[1] - q[1], q[0] - p[0]]) / np.linalg.norm(q - p)
+        inward = np.minimum(inward, points @ n.astype(np.float32) - np.float32(n @ p))
+    nearest, deepest = np.minimum.reduceat(inward, begin), np.maximum.reduceat(inward, begin)
+    # shadow, dirt and rest of the frame: it touches the border and stays beside it
+    rim = (nearest < margin + 3.0) & (deepest < max(4.0, RIM * shorter))
+    good = (hits >= np.maximum(3.0, 0.1 * area)) & (area >= SPECK) & ~rim
+    wide = THING * shorter + 1.5
+    outlines, filled = {}, np.zeros(len(good))
+    for i in np.flatnonzero(good):
+        x, y, w, h = stats[i + 1, :4]
+        piece = (label[y : y + h, x : x + w] == i + 1).astype(np.uint8)
+        found, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        line = max(found, key=len).reshape(-1, 2)
+        outlines[i] = piece, (line + (x, y) + low).astype(np.float64)
+        if radius[i] > wide:
+            # without what blur adds around it, and without what joins letters that run together
+            solid = cv2.findNonZero(piece * (taken[y : y + h, x : x + w] > 153.0 * strength[i]).astype(np.uint8))
+            filled[i] = len(solid) / max(cv2.contourArea(cv2.convexHull(solid)), 1.0)
+    # half of the ink is in pieces at most so thick; a filled piece tells nothing of a pen's width
+    drawn = np.flatnonzero(good & (filled < 0.6))
+    drawn = drawn[np.argsort(radius[drawn], kind="stable")]
+    mass = np.cumsum(area[drawn])
+    pen = float(radius[drawn[np.searchsorted(mass, 0.5 * mass[-1])]]) if len(drawn) else 0.0
+    # a magnet, a sticker, an eraser, a hand: as wide as no stroke, and filled or reaching in from outside
+    thing = (radius > np.maximum(wide, 1.8 * pen)) & ((filled > 0.9) | (nearest < margin + 3.0))
     polygons, objects, contrast = [], [], []
-    if count > 1:
-        strength = np.zeros(count, np.float64)
-        ys, xs = np.nonzero(weak)
-        names = label[ys, xs]
-        values = taken[ys, xs].astype(np.float64)
-        hits = np.bincount(names, values > clear, count)
-        strength = np.bincount(names, np.where(values > clear, values, 0.0), count) / np.maximum(hits, 1)
-        area = stats[:, cv2.CC_STAT_AREA]
-        good = (hits >= np.maximum(3, 0.1 * area)) & (area >= SPECK)
-        good[0] = False
-        thick = cv2.distanceTransform(weak, cv2.DIST_L2, 3)
-        radius = np.zeros(count)
-        np.maximum.at(radius, names, thick[ys, xs])
-        for i in np.flatnonzero(good):
-            x, y, w, h = stats[i, :4]
-            piece = (label[y : y + h, x : x + w] == i).astype(np.uint8)
-            outline, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-            points = max(outline, key=len).reshape(-1, 2) + (x, y) + low
-            compact = area[i] < 2.5 * np.pi * radius[i] ** 2 and radius[i] > 0.22 * size
-            if compact:
-                objects.append(points.astype(np.float64))
-            else:
-                polygons.append(points.astype(np.float64))
-                contrast.append(strength[i] / 255.0)
-                view = mask[low[1] + y : low[1] + y + h, low[0] + x : low[0] + x + w]
-                view |= piece > 0
+    for i, (piece, line) in outlines.items():
+        if thing[i]:
+            objects.append(line)
+            continue
+        x, y, w, h = stats[i + 1, :4]
+        polygons.append(line)
+        contrast.append(strength[i])
+        view = mask[low[1] + y : low[1] + y + h, low[0] + x : low[0] + x + w]
+        view |= piece > 0
     return Ink(mask, tuple(polygons), tuple(objects), np.array(contrast))
