@@ -1,7 +1,7 @@
 """Whiteboards drawn with OpenCV: a random board, its ink, its room, its light and its camera, with the truth beside.
 
-Everything is drawn from a seed. The board is a flat texture (frame, surface, handwriting, smudges) that a pinhole camera
-sees through a homography; room, shadows, reflections, lens distortion, blur, noise and JPEG come on top.
+Everything is drawn from a seed. The board is a flat texture (frame, surface, handwriting, smudges) that a pinhole
+camera sees through a homography; room, shadows, reflections, lens distortion, blur, noise and JPEG come on top.
 """
 
 from __future__ import annotations
@@ -80,7 +80,9 @@ def scene(seed: int, *, board: bool = True, dirty: bool | None = None) -> Scene:
         surface_mask = np.zeros(alpha.shape, np.uint8)
         cv2.fillConvexPoly(surface_mask, np.int32(np.rint(inner)), 255)
         surface_mask[cv2.dilate(spoiled, np.ones((25, 25), np.uint8)) > 0] = 0
-        bare = cv2.erode(cv2.warpPerspective(surface_mask, H, full, flags=cv2.INTER_NEAREST), np.ones((25, 25), np.uint8))
+        bare = cv2.erode(
+            cv2.warpPerspective(surface_mask, H, full, flags=cv2.INTER_NEAREST), np.ones((25, 25), np.uint8)
+        )
         truth = cv2.perspectiveTransform(inner[None].astype(np.float64), H)[0]
         room, covered = _in_front(rng, room, truth)
         bare[covered > 0] = 0
@@ -125,7 +127,9 @@ def _room(rng: np.random.Generator, surface: Array) -> Float:
     room = np.ones((h, w, 3), np.float32) * base.astype(np.float32)
     room *= 1.0 + 0.05 * _smooth(rng, (h, w), 4)[..., None]
     if kind == 2:
-        grain = cv2.resize(rng.normal(0, 1, (h // 4, w // 100)).astype(np.float32), (w, h), interpolation=cv2.INTER_CUBIC)
+        grain = cv2.resize(
+            rng.normal(0, 1, (h // 4, w // 100)).astype(np.float32), (w, h), interpolation=cv2.INTER_CUBIC
+        )
         room *= 1.0 + rng.uniform(0.01, 0.06) * grain[..., None]
     else:
         room *= 1.0 + rng.uniform(0.0, 0.02) * _smooth(rng, (h, w), 300)[..., None]
@@ -138,7 +142,7 @@ def _room(rng: np.random.Generator, surface: Array) -> Float:
         upright = rng.random() < 0.3
         line = [[x[0], 0], [x[1], h], [w, h], [w, 0]] if upright else [[0, y[0]], [w, y[1]], [w, h], [0, h]]
         mask = np.zeros((h, w), np.uint8)
-        cv2.fillPoly(mask, [np.int32(line)], 255)
+        cv2.fillPoly(mask, [np.array(line, np.int32)], 255)
         room[mask > 0] *= np.float32(rng.uniform(0.45, 0.95))
     return np.clip(room, 0, 255)
 
@@ -154,7 +158,9 @@ def _object(rng: np.random.Generator, room: Float, colour: tuple[float, ...]) ->
     if kind <= 1:
         cv2.fillPoly(room, [box], colour, cv2.LINE_AA)
         if rng.random() < 0.5:
-            cv2.polylines(room, [box], True, tuple(rng.uniform(0, 255, 3)), int(rng.integers(2, 20)), cv2.LINE_AA)
+            cv2.polylines(
+                room, [box], True, tuple(rng.uniform(0, 255, 3)), int(rng.integers(2, 20)), cv2.LINE_AA
+            )
     elif kind == 2:  # a picture: texture in a box
         mask = np.zeros((h, w), np.uint8)
         cv2.fillPoly(mask, [box], 255)
@@ -176,8 +182,13 @@ def _board(
     """Texture with frame, its opacity, ink, everything on the surface, corners of the surface, kind of frame."""
     w, h = size
     kind = str(rng.choice(["aluminium", "thin", "wood", "white", "none"], p=[0.5, 0.15, 0.12, 0.13, 0.1]))
-    width = {"aluminium": rng.uniform(15, 75), "thin": rng.uniform(7, 16), "wood": rng.uniform(25, 80),
-             "white": rng.uniform(20, 60), "none": 4.0}[kind]
+    width = {
+        "aluminium": rng.uniform(15, 75),
+        "thin": rng.uniform(7, 16),
+        "wood": rng.uniform(25, 80),
+        "white": rng.uniform(20, 60),
+        "none": 4.0,
+    }[kind]
     f = round(min(width, 0.07 * min(w, h)))
     margin = 40
     o = f + margin
@@ -279,13 +290,17 @@ def _write(rng: np.random.Generator, face: Float, marks: Image) -> None:
         if rng.random() < 0.6:
             scale = rng.uniform(1.0, 3.5)
             text = " ".join(rng.choice(_WORDS, rng.integers(1, 4)))
-            cv2.putText(layer, text, (int(at[0]), int(at[1])), int(rng.choice(_FONTS)), scale, 255, thick, cv2.LINE_AA)
+            cv2.putText(
+                layer, text, (int(at[0]), int(at[1])), int(rng.choice(_FONTS)), scale, 255, thick, cv2.LINE_AA
+            )
         elif rng.random() < 0.6:  # scribbles
             n = int(rng.integers(4, 10))
             knots = np.cumsum(rng.normal(0, rng.uniform(10, 50), (n, 2)), 0) + at
             t = np.linspace(0, n - 1, 12 * n)
             curve = np.stack([np.interp(t, np.arange(n), knots[:, k]) for k in range(2)], 1)
-            curve = cv2.GaussianBlur(curve.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=4.0, borderType=cv2.BORDER_REPLICATE)
+            curve = cv2.GaussianBlur(
+                curve.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=4.0, borderType=cv2.BORDER_REPLICATE
+            )
             cv2.polylines(layer, [np.int32(curve)], False, 255, thick, cv2.LINE_AA)
         else:  # boxes, arrows, circles
             to = at + rng.uniform(-350, 350, 2)
@@ -296,16 +311,29 @@ def _write(rng: np.random.Generator, face: Float, marks: Image) -> None:
             elif shape == 1:
                 cv2.arrowedLine(layer, a, b, 255, thick, cv2.LINE_AA, tipLength=0.1)
             else:
-                cv2.ellipse(layer, a, (int(rng.integers(15, 120)), int(rng.integers(15, 120))), 0, 0, 360, 255, thick, cv2.LINE_AA)
+                cv2.ellipse(
+                    layer,
+                    a,
+                    (int(rng.integers(15, 120)), int(rng.integers(15, 120))),
+                    0,
+                    0,
+                    360,
+                    255,
+                    thick,
+                    cv2.LINE_AA,
+                )
         edge = 12
         layer[:edge] = layer[-edge:] = 0
         layer[:, :edge] = layer[:, -edge:] = 0
-        strength = rng.uniform(0.55, 1.0)
-        opacity = layer.astype(np.float32) / 255.0 * np.float32(strength)
-        opacity *= np.clip(1.0 - 0.15 * _smooth(rng, (h, w), 60), 0.4, 1.0)
+        x, y, bw, bh = cv2.boundingRect(layer)
+        if bw < 2 or bh < 2:
+            continue
+        part = (slice(y, y + bh), slice(x, x + bw))
+        opacity = layer[part].astype(np.float32) / 255.0 * np.float32(rng.uniform(0.55, 1.0))
+        opacity *= np.clip(1.0 - 0.15 * _smooth(rng, (bh, bw), max(2, max(bh, bw) // 25)), 0.4, 1.0)
         pen = np.array(pens[rng.integers(0, len(pens))], np.float32)
-        face[:] = face * (1.0 - opacity[..., None]) + pen * opacity[..., None]
-        marks[layer > 127] = 255
+        face[part] = face[part] * (1.0 - opacity[..., None]) + pen * opacity[..., None]
+        marks[part][layer[part] > 127] = 255
 
 
 def _magnets(rng: np.random.Generator, face: Float, marks: Image, spoiled: Image) -> None:
@@ -328,10 +356,21 @@ def _magnets(rng: np.random.Generator, face: Float, marks: Image, spoiled: Image
 def _view(rng: np.random.Generator, w: int, h: int) -> Array:
     """Homography from texture pixels to the picture (twice its size): a tilted pinhole camera, all corners in view."""
     while True:
-        yaw, pitch, roll = np.radians(rng.uniform(-50, 50)), np.radians(rng.uniform(-40, 40)), np.radians(rng.normal(0, 8))
-        R = cv2.Rodrigues(np.array([0, 0, roll]))[0] @ cv2.Rodrigues(np.array([pitch, 0, 0]))[0] @ cv2.Rodrigues(np.array([0, yaw, 0]))[0]
+        yaw, pitch, roll = (
+            np.radians(rng.uniform(-50, 50)),
+            np.radians(rng.uniform(-40, 40)),
+            np.radians(rng.normal(0, 8)),
+        )
+        R = (
+            cv2.Rodrigues(np.array([0, 0, roll]))[0]
+            @ cv2.Rodrigues(np.array([pitch, 0, 0]))[0]
+            @ cv2.Rodrigues(np.array([0, yaw, 0]))[0]
+        )
         focal = rng.uniform(0.8, 1.6) * 2 * WIDTH
-        plane = np.array([[-w / 2, -h / 2, 0], [w / 2, -h / 2, 0], [w / 2, h / 2, 0], [-w / 2, h / 2, 0]]) / 1000.0
+        plane = (
+            np.array([[-w / 2, -h / 2, 0], [w / 2, -h / 2, 0], [w / 2, h / 2, 0], [-w / 2, h / 2, 0]])
+            / 1000.0
+        )
         seen = plane @ R.T
         depth = rng.uniform(1.2, 6.0)
         seen[:, 2] += depth
@@ -344,7 +383,7 @@ def _view(rng: np.random.Generator, w: int, h: int) -> Array:
             continue
         shift = rng.uniform(20 - low, 20 + room - high)
         to = (p + shift).astype(np.float32)
-        corners = np.float32([[0, 0], [w, 0], [w, h], [0, h]]) - np.float32(0.5)
+        corners = np.array([[0, 0], [w, 0], [w, h], [0, h]], np.float32) - np.float32(0.5)
         if cv2.contourArea(to) < 0.06 * 4 * WIDTH * HEIGHT:
             continue
         return cv2.getPerspectiveTransform(corners, to)
@@ -355,7 +394,9 @@ def _drop_shadow(rng: np.random.Generator, room: Float, opaque: Float) -> Float:
     if rng.random() < 0.5:
         return room
     dx, dy = rng.uniform(-25, 25, 2)
-    moved = cv2.warpAffine(opaque, np.float32([[1, 0, dx], [0, 1, dy]]), (opaque.shape[1], opaque.shape[0]))
+    moved = cv2.warpAffine(
+        opaque, np.array([[1, 0, dx], [0, 1, dy]], np.float32), (opaque.shape[1], opaque.shape[0])
+    )
     moved = cv2.GaussianBlur(moved, (0, 0), rng.uniform(2, 15))
     return room * (1.0 - np.float32(rng.uniform(0.1, 0.5)) * moved[..., None])
 
@@ -421,11 +462,21 @@ def _camera(
     h, w = room.shape[:2]
     K = np.array([[1.2 * w, 0, w / 2], [0, 1.2 * w, h / 2], [0, 0, 1]])
     k = np.array([rng.normal(0, 0.012), 0, 0, 0, 0])
-    grid = np.stack(np.meshgrid(np.arange(0, w, 20), np.arange(0, h, 20)), -1).reshape(-1, 1, 2).astype(np.float64)
+    grid = (
+        np.stack(np.meshgrid(np.arange(0, w, 20), np.arange(0, h, 20)), -1)
+        .reshape(-1, 1, 2)
+        .astype(np.float64)
+    )
     straight = cv2.undistortPoints(grid, K, k, P=K).reshape(len(range(0, h, 20)), len(range(0, w, 20)), 2)
     # bilinear between nodes 20 pixels apart: the field is smooth
     nodes = np.stack(np.meshgrid(np.arange(w) / 20.0, np.arange(h) / 20.0), -1).astype(np.float32)
-    maps = cv2.remap(straight.astype(np.float32), nodes[..., 0], nodes[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    maps = cv2.remap(
+        straight.astype(np.float32),
+        nodes[..., 0],
+        nodes[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
     room = cv2.remap(room, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     masks = tuple(cv2.remap(m, maps, None, cv2.INTER_LINEAR) for m in masks)
     if corners is not None:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ..arm import Array
-from ._image import Float, Image
+from ._image import Float, Image, Index, Mask
 from ._quads import homographies, mapped
 
 ALONG = 60
@@ -39,7 +39,7 @@ class Edges:
     """(4,) deviation of the edge points from the fitted line [pixels]"""
 
 
-def fit(image: Image, corners: Array, border: Array) -> Edges:
+def fit(image: Image, corners: Array, border: Mask) -> Edges:
     """Find the inner edges and fit lines to them.
 
     Args:
@@ -70,7 +70,7 @@ class _Steps:
         return 0.5 * (self.begin + self.end)
 
 
-def _inner(image: Image, corners: Array, border: Array) -> Array:
+def _inner(image: Image, corners: Array, border: Mask) -> Array:
     """The quadrangle of the innermost edges near the rough one."""
     found = _steps(image, corners)
     lines = np.zeros((4, 3))
@@ -138,7 +138,7 @@ def _steps(image: Image, corners: Array) -> list[_Steps]:
     return found
 
 
-def _paths(weight: Array) -> tuple[Array, Array]:
+def _paths(weight: Array) -> tuple[Index, Array]:
     """Best ways along strips (S, rows, pieces) through every row of the middle piece, moving by one row at most.
 
     Returns:
@@ -181,7 +181,7 @@ def _innermost(steps: _Steps, opposite: _Steps | None) -> int | None:
     return None
 
 
-def _fitted(image: Image, corners: Array, border: Array, reach: float) -> Edges:
+def _fitted(image: Image, corners: Array, border: Mask, reach: float) -> Edges:
     """Lines through the strongest step within `reach` pixels of each side."""
     lines = np.zeros((4, 3))
     seen, spread = np.ones(4), np.zeros(4)
@@ -225,7 +225,7 @@ def _rough_line(step: Float, t: Array, v: Array) -> tuple[tuple[float, float], A
     """The edge nearest to the middle in steps (rows, ALONG, 3) at distances v.
 
     Returns:
-        a and b of v = a + b t, and the unit colour (3,) along which the picture gets brighter there, towards the inside;
+        a and b of v = a + b t, and the unit colour (3,) along which the picture gets brighter there, going in;
         None: no edge.
     """
     pieces = np.median(step.reshape(len(v), PIECES, -1, 3), 2)

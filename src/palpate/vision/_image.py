@@ -13,6 +13,8 @@ from ..errors import InputError
 
 Image = npt.NDArray[np.uint8]
 Float = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+Index = npt.NDArray[np.int64]
 
 SMALLEST = 64
 """shorter side of a usable picture [pixels]"""
@@ -52,8 +54,10 @@ def checked(image: npt.ArrayLike, name: str = "image") -> Image:
             f"{name}: expected uint8 (H, W) grey, (H, W, 3) BGR or (H, W, 4), got {array.dtype} {array.shape}"
         )
     if min(array.shape[:2]) < SMALLEST:
-        raise InputError(f"{name}: {array.shape[1]}x{array.shape[0]} pixels are too few; expected at least "
-                         f"{SMALLEST} on the shorter side")
+        raise InputError(
+            f"{name}: {array.shape[1]}x{array.shape[0]} pixels are too few; expected at least "
+            f"{SMALLEST} on the shorter side"
+        )
     if array.ndim == 2 or array.shape[2] == 1:
         return cv2.cvtColor(np.ascontiguousarray(array.reshape(array.shape[:2])), cv2.COLOR_GRAY2BGR)
     return np.ascontiguousarray(array[..., :3])

@@ -1,8 +1,8 @@
 """Ink on a writing surface: thin strokes darker or of another colour than what is around them.
 
-A stroke is narrow, so a morphological closing removes it: closing minus picture ("black hat", F. Meyer 1979) is what the
-stroke took away from the light, channel by channel. Steps of brightness (shadows, edges of reflections) pass a closing
-unchanged and leave nothing. A dark gap between two reflections would leave something; it is told from ink by the
+A stroke is narrow, so a morphological closing removes it: closing minus picture ("black hat", F. Meyer 1979) is what
+the stroke took away from the light, channel by channel. Steps of brightness (shadows, edges of reflections) pass a
+closing unchanged and leave nothing. A dark gap between two reflections would leave something; it is told from ink by the
 surface's usual level around it, which ink falls below and a gap does not.
 """
 
@@ -12,12 +12,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from ..arm import Array
-from ._image import Image
-
-Mask = npt.NDArray[np.bool_]
+from ._image import Image, Mask
 
 STROKE = 0.055
 """widest stroke, relative to the board's shorter side"""
@@ -102,7 +99,7 @@ def _level(board: Image, inside: Image) -> Image:
     full = np.where(part > 0.5, small / np.maximum(part, 0.5), 0.0)
     # fill the outside from within, by wider and wider means
     for k in (9, 33, 129):
-        weight = cv2.blur((part[..., 0] > 0.5).astype(np.float32) if k == 9 else (full.max(2) > 0).astype(np.float32), (k, k))
+        weight = cv2.blur((full.max(2) > 0).astype(np.float32), (k, k))
         mean = cv2.blur(full, (k, k)) / np.maximum(weight, 1e-3)[..., None]
         full = np.where(full.max(2, keepdims=True) > 0, full, mean)
     wide = cv2.medianBlur(np.clip(full, 0, 255).astype(np.uint8), 2 * (min(size) // 5) + 1)
@@ -110,7 +107,14 @@ def _level(board: Image, inside: Image) -> Image:
 
 
 def _pieces(
-    weak: Image, taken: Image, clear: float, corners: Array, low: Array, shape: tuple[int, int], shorter: float, margin: float
+    weak: Image,
+    taken: Image,
+    clear: float,
+    corners: Array,
+    low: Array,
+    shape: tuple[int, int],
+    shorter: float,
+    margin: float,
 ) -> Ink:
     """Connected pieces that are clear somewhere, sorted into ink and other things."""
     mask = np.zeros(shape, bool)
@@ -145,10 +149,12 @@ def _pieces(
         piece = (label[y : y + h, x : x + w] == i + 1).astype(np.uint8)
         found, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
         line = max(found, key=len).reshape(-1, 2)
-        outlines[i] = piece, (line + (x, y) + low).astype(np.float64)
+        outlines[i] = piece, (line + low + np.array([x, y])).astype(np.float64)
         if radius[i] > wide:
             # without what blur adds around it, and without what joins letters that run together
-            solid = cv2.findNonZero(piece * (taken[y : y + h, x : x + w] > 153.0 * strength[i]).astype(np.uint8))
+            solid = cv2.findNonZero(
+                piece * (taken[y : y + h, x : x + w] > 153.0 * strength[i]).astype(np.uint8)
+            )
             filled[i] = len(solid) / max(cv2.contourArea(cv2.convexHull(solid)), 1.0)
     # half of the ink is in pieces at most so thick; a filled piece tells nothing of a pen's width
     drawn = np.flatnonzero(good & (filled < 0.6))

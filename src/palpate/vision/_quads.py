@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from ..arm import Array
-from ._image import Float, Image
+from ._image import Float, Image, Index, Mask
 from ._lines import Gradient, Lines
 
 SIDE = 0.35
@@ -35,7 +34,7 @@ class Quads:
 
     corners: Array
     """(K, 4, 2) [pixels], clockwise as seen"""
-    border: Array
+    border: Mask
     """(K, 4) bool: the side from corner i to i+1 is the picture's border"""
     features: Array
     """(K, F), see FEATURES"""
@@ -88,18 +87,14 @@ def find(lines: Lines, gradient: Gradient, image: Image, grey: Image) -> Quads:
     )
     area = np.abs(area)
     keep = _convex(corners) & (area > SMALLEST * width * height)
-    order, corners, supports, junctions, area = (
-        x[keep] for x in (order, corners, supports, junctions, area)
-    )
+    order, corners, supports, junctions, area = (x[keep] for x in (order, corners, supports, junctions, area))
     if not len(order):
         return _none()
     quick = (
         supports.mean(1) + 0.5 * supports.min(1) + 0.3 * junctions.mean(1) + 0.12 * np.log(area / area.max())
     )
     best = np.argsort(-quick, kind="stable")[:SHORTLIST]
-    order, corners, supports, junctions, area = (
-        x[best] for x in (order, corners, supports, junctions, area)
-    )
+    order, corners, supports, junctions, area = (x[best] for x in (order, corners, supports, junctions, area))
     inside = _inside(corners, image, grey, gradient)
     features = np.column_stack(
         [
@@ -123,7 +118,7 @@ def _none() -> Quads:
 class _Support:
     """Which points of the lines lie on edges."""
 
-    def __init__(self, normal: Array, offset: Array, border: Array, gradient: Gradient) -> None:
+    def __init__(self, normal: Array, offset: Array, border: Mask, gradient: Gradient) -> None:
         height, width = gradient.x.shape
         self.along = np.stack([-normal[:, 1], normal[:, 0]], 1)
         centre = np.array([width / 2.0, height / 2.0])
@@ -153,9 +148,11 @@ class _Support:
         self.crossing = np.stack([x, y], 2)
         slack = 2.0
         self.crosses &= (x > -slack) & (x < width - 1 + slack) & (y > -slack) & (y < height - 1 + slack)
-        self.t = np.where(self.crosses, np.einsum("abk,ak->ab", self.crossing - self.origin[:, None], self.along), 0.0)
+        self.t = np.where(
+            self.crosses, np.einsum("abk,ak->ab", self.crossing - self.origin[:, None], self.along), 0.0
+        )
 
-    def sides(self, i: Array, j: Array, shortest: float) -> tuple[Array, Array, Array]:
+    def sides(self, i: Index, j: Index, shortest: float) -> tuple[Array, Array, Mask]:
         """Of every line between its crossings with lines i and j: support, junctions, whether it may be a side."""
         n = len(self.t)
         rows = np.arange(n)[:, None]
@@ -182,7 +179,7 @@ def _area(corners: Array) -> Array:
     return 0.5 * (x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(1)
 
 
-def _convex(corners: Array) -> Array:
+def _convex(corners: Array) -> Mask:
     edge = np.roll(corners, -1, 1) - corners
     after = np.roll(edge, -1, 1)
     cross = edge[..., 0] * after[..., 1] - edge[..., 1] * after[..., 0]
@@ -218,7 +215,9 @@ def picked(channel: Image | Float, points: Array) -> Array:
     return channel[y, x].astype(np.float32)
 
 
-def _inside(corners: Array, image: Image, grey: Image, gradient: Gradient) -> tuple[Array, Array, Array, Array]:
+def _inside(
+    corners: Array, image: Image, grey: Image, gradient: Gradient
+) -> tuple[Array, Array, Array, Array]:
     """Flat part, part explained by a smooth surface, brightness, saturation."""
     u = np.linspace(0.05, 0.95, GRID)
     grid = np.stack(np.meshgrid(u, u), -1).reshape(-1, 2)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ..arm import Array
 from . import _edges, _lines, _quads
-from ._image import Image, checked, rescaled, shrunk
+from ._image import Mask, checked, rescaled, shrunk
 
 ROUGH = 512
 """longer side of the copy in which boards are looked for [pixels]"""
@@ -36,7 +36,7 @@ class Board:
     """(4, 2) [pixels], clockwise as seen, from the one nearest to the top left; whole numbers are pixel centres"""
     confidence: float
     """0 to 1: how likely it is a board found rightly"""
-    in_view: npt.NDArray[np.bool_]
+    in_view: Mask
     """(4,): the side from corner i to the next is the board's own edge; False: it is where the picture ends"""
     spread: Array
     """(4,) deviation of the edge from a straight line, per side [pixels]"""
