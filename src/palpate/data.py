@@ -273,16 +273,31 @@ def get(name: str, *, accept_licence: Consent) -> Path:
     return folder
 
 
-def _folders(data: DataSet) -> Iterator[Path]:
-    """Where the set may be, in order."""
+def local(folder: str) -> Path | None:
+    """A folder that lies beside the data sets (in ``PALPATE_DATA`` or in ``../shared/data``); None: there is none.
+
+    Raises:
+        LogError: ``PALPATE_DATA`` is no folder.
+    """
+    return next((root / folder for root in _roots() if (root / folder).is_dir()), None)
+
+
+def _roots() -> Iterator[Path]:
+    """Folders that hold data sets, but for the user's cache."""
     named = os.environ.get(VARIABLE)
     if named:
         if not Path(named).is_dir():
             raise LogError(f"{VARIABLE} is {named!r}, which is no folder")
-        yield Path(named) / data.folder
+        yield Path(named)
     for root in (*_above(Path.cwd()), *_above(Path(__file__).resolve().parent)):
         if (root / "src" / "palpate" / "data.py").is_file():
-            yield root.parent / "shared" / "data" / data.folder
+            yield root.parent / "shared" / "data"
+
+
+def _folders(data: DataSet) -> Iterator[Path]:
+    """Where the set may be, in order."""
+    for root in _roots():
+        yield root / data.folder
     try:
         import pooch
     except ImportError:

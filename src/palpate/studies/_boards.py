@@ -17,6 +17,7 @@ from ..arm import Array
 
 Image = npt.NDArray[np.uint8]
 Float = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 WIDTH, HEIGHT = 1280, 720
 _WORDS = (
@@ -41,9 +42,9 @@ class Scene:
     """(H, W, 3) BGR"""
     corners: Array | None
     """(4, 2) of the writing surface [pixels], clockwise from the top-left one of the board; None: no board"""
-    ink: npt.NDArray[np.bool_]
+    ink: Mask
     """(H, W) where ink is, at least half opaque"""
-    clean: npt.NDArray[np.bool_]
+    clean: Mask
     """(H, W) writing surface without ink, smudge, magnet or anything else that is not the bare surface nearby"""
     dirty: bool
     """there is writing"""
@@ -110,6 +111,15 @@ def _smooth(rng: np.random.Generator, shape: tuple[int, int], cells: int) -> Flo
     h, w = shape
     coarse = rng.normal(0.0, 1.0, (max(2, cells * h // max(h, w) + 2), cells + 2)).astype(np.float32)
     return cv2.resize(coarse, (w, h), interpolation=cv2.INTER_CUBIC)
+
+
+def _blurred(layer: Float, sigma: float) -> Float:
+    """Gaussian blur; a wide one on a small copy."""
+    if sigma < 10.0:
+        return cv2.GaussianBlur(layer, (0, 0), sigma)
+    h, w = layer.shape
+    small = cv2.resize(layer, (w // 4, h // 4), interpolation=cv2.INTER_AREA)
+    return cv2.resize(cv2.GaussianBlur(small, (0, 0), sigma / 4.0), (w, h), interpolation=cv2.INTER_LINEAR)
 
 
 def _room(rng: np.random.Generator, surface: Array) -> Float:
@@ -397,7 +407,7 @@ def _drop_shadow(rng: np.random.Generator, room: Float, opaque: Float) -> Float:
     moved = cv2.warpAffine(
         opaque, np.array([[1, 0, dx], [0, 1, dy]], np.float32), (opaque.shape[1], opaque.shape[0])
     )
-    moved = cv2.GaussianBlur(moved, (0, 0), rng.uniform(2, 15))
+    moved = _blurred(moved, rng.uniform(2, 15))
     return room * (1.0 - np.float32(rng.uniform(0.1, 0.5)) * moved[..., None])
 
 
@@ -433,7 +443,7 @@ def _glare(rng: np.random.Generator, room: Float, corners: Array) -> Float:
             cv2.ellipse(layer, box, 1.0, -1)
         else:
             cv2.fillPoly(layer, [np.int32(cv2.boxPoints(box))], 1.0)
-        layer = cv2.GaussianBlur(layer, (0, 0), float(np.exp(rng.uniform(np.log(3), np.log(50)))))
+        layer = _blurred(layer, float(np.exp(rng.uniform(np.log(3), np.log(50)))))
         room = room + np.float32(rng.uniform(20, 130)) * (layer * mask)[..., None]
     return room
 
@@ -448,7 +458,7 @@ def _light(rng: np.random.Generator, room: Float) -> Float:
         centre = rng.uniform([0, 0], [w, h])
         points = centre + rng.normal(0, 0.35 * w, (rng.integers(3, 7), 2))
         cv2.fillConvexPoly(shade, cv2.convexHull(np.int32(points)), 1.0)
-        shade = cv2.GaussianBlur(shade, (0, 0), float(np.exp(rng.uniform(np.log(4), np.log(80)))))
+        shade = _blurred(shade, float(np.exp(rng.uniform(np.log(4), np.log(80)))))
         gain *= 1.0 - np.float32(rng.uniform(0.05, 0.35)) * shade
     gain *= 1.0 - np.float32(rng.uniform(0, 0.2)) * (x**2 + y**2)
     balance = (1.0 + rng.normal(0, 0.05, 3)).astype(np.float32) * np.float32(rng.uniform(0.55, 1.08))

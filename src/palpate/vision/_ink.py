@@ -2,8 +2,8 @@
 
 A stroke is narrow, so a morphological closing removes it: closing minus picture ("black hat", F. Meyer 1979) is what
 the stroke took away from the light, channel by channel. Steps of brightness (shadows, edges of reflections) pass a
-closing unchanged and leave nothing. A dark gap between two reflections would leave something; it is told from ink by the
-surface's usual level around it, which ink falls below and a gap does not.
+closing unchanged and leave nothing. A dark gap between two reflections would leave something; it is told from ink by
+the surface's usual level around it, which ink falls below and a gap does not.
 """
 
 from __future__ import annotations
