@@ -19,9 +19,11 @@ OUTWARD, INWARD = 0.03, 0.11
 """how far from the rough side the surface's edge is looked for, relative to the board"""
 ROWS = 110
 """steps looked at across a side"""
+SLANTS = np.array([[-0.02, 0.02], [0.02, -0.02], [-0.045, 0.045], [0.045, -0.045], [0.0, 0.06], [0.06, 0.0]])
+"""how a side may run askew, relative to the board at its two ends"""
 FAINT = 0.12
 """an edge is at least so strong, relative to the strongest along its side"""
-GAP = 0.04
+GAP = 0.08
 """a frame shows an edge at least every so often, relative to the board"""
 MOST = 0.6
 """part of the pieces in which an edge must be seen"""
@@ -64,6 +66,8 @@ class _Steps:
     """(M,) distance from the rough side at its first corner"""
     end: Array
     """(M,) at its second corner"""
+    strength: float
+    """of all of them together [grey levels over two rows]"""
 
     @property
     def middle(self) -> Array:
@@ -72,12 +76,18 @@ class _Steps:
 
 def _inner(image: Image, corners: Array, border: Mask) -> Array:
     """The quadrangle of the innermost edges near the rough one."""
-    found = _steps(image, corners)
+    around = [np.roll(corners, -side, 0) for side in range(4)]
+    found = _steps(image, np.array(around), np.zeros((4, 2)))
+    for side in range(4):
+        if len(found[side].begin) < 2 and not border[side]:
+            # the rough side may run askew, from the frame's outer edge to the inner one
+            askew = _steps(image, np.array([around[side]] * len(SLANTS)), SLANTS)
+            found[side] = max(found[side], *askew, key=lambda steps: steps.strength)
     lines = np.zeros((4, 3))
     for side, steps in enumerate(found):
         i = None if border[side] else _innermost(steps, None if border[side - 2] else found[side - 2])
         v = (0.0, 0.0) if i is None else (steps.begin[i], steps.end[i])
-        p, q = mapped(homographies(np.roll(corners, -side, 0)[None]), np.array([[0.0, v[0]], [1.0, v[1]]]))[0]
+        p, q = mapped(homographies(around[side][None]), np.array([[0.0, v[0]], [1.0, v[1]]]))[0]
         lines[side] = *_normal(p, q), _normal(p, q) @ p
     return _met(lines)
 
@@ -93,35 +103,44 @@ def _met(lines: Array) -> Array:
     return np.array([np.linalg.solve(lines[[k - 1, k], :2], lines[[k - 1, k], 2]) for k in range(4)])
 
 
-def _steps(image: Image, corners: Array) -> list[_Steps]:
-    """Where edges run along the four sides."""
+def _steps(image: Image, around: Array, slants: Array) -> list[_Steps]:
+    """Where edges run along sides.
+
+    Args:
+        image: (H, W, 3).
+        around: (S, 4, 2) corners; the side is the one from the first to the second.
+        slants: (S, 2) where rows begin and end, relative to the side, as ``begin`` and ``end`` of the result.
+    """
     u = np.linspace(0.04, 0.96, ALONG)
     v = np.linspace(-OUTWARD, INWARD, ROWS + 2)
+    strips = len(around)
     grid = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
-    around = np.stack([np.roll(corners, -side, 0) for side in range(4)])
-    points = mapped(homographies(around), grid).reshape(4, ROWS + 2, ALONG, 2)
+    points = np.empty((strips, ROWS + 2, ALONG, 2))
+    for k, H in enumerate(homographies(around)):
+        lean = slants[k, 0] + (slants[k, 1] - slants[k, 0]) * grid[:, :1]
+        points[k] = mapped(H[None], grid + lean * np.array([0.0, 1.0])).reshape(ROWS + 2, ALONG, 2)
     level = np.stack([cv2.blur(_sampled(image, p), (1, 3)) for p in points])
     step = level[:, 2:] - level[:, :-2]
     # per piece the median over its columns: a stroke or a magnet covers few of them
-    pieces = np.sort(step.reshape(4, ROWS, PIECES, -1, 3), 3)[:, :, :, ALONG // PIECES // 2]
+    pieces = np.sort(step.reshape(strips, ROWS, PIECES, -1, 3), 3)[:, :, :, ALONG // PIECES // 2]
     noise = 1.4826 * np.median(np.abs(pieces[:, -ROWS // 3 :]), axis=(1, 2, 3))  # mostly surface
     threshold = np.tile(np.clip(4.0 * noise, 2.5, 8.0), 2)[:, None]
     signed = np.concatenate([pieces, -pieces])
     size = np.maximum(np.maximum(signed[..., 0], signed[..., 1]), np.maximum(signed[..., 2], 0.0))
     path, total = _paths(np.minimum(size / threshold[:, :, None], 3.0))
     sizes = np.take_along_axis(size, path, 1)
-    strength = np.median(sizes, 2)
+    strength = np.sort(sizes, 2)[:, :, PIECES // 2]
     clear = ((sizes > threshold[:, :, None]).mean(2) >= MOST) & (strength > threshold)
-    strongest = np.where(clear, strength, 0.0).reshape(2, 4, ROWS).max((0, 2))
+    strongest = np.where(clear, strength, 0.0).reshape(2, strips, ROWS).max((0, 2))
     clear &= strength > FAINT * np.tile(strongest, 2)[:, None]
     padded = np.pad(total, ((0, 0), (3, 3)))
     clear &= total >= np.max([padded[:, k : k + ROWS] for k in range(7)], 0)
     along = (np.arange(PIECES) + 0.5) / PIECES * 0.92 - 0.46
     found = []
-    for side in range(4):
-        which, row = np.nonzero(clear[side::4])
-        which = which * 4 + side
-        weight, at = np.minimum(sizes[which, row], threshold[side]) + 1e-3, path[which, row] + 1.0
+    for k in range(strips):
+        which, row = np.nonzero(clear[k::strips])
+        which = which * strips + k
+        weight, at = np.minimum(sizes[which, row], threshold[k]) + 1e-3, path[which, row] + 1.0
         whole = weight.sum(1)
         mean, centre = (weight * at).sum(1) / whole, (weight * along).sum(1) / whole
         off = along - centre[:, None]
@@ -134,7 +153,13 @@ def _steps(image: Image, corners: Array) -> list[_Steps]:
                 kept.append(int(i))
         kept.sort(key=lambda i: ends[i].sum())
         place = v[0] + (v[1] - v[0]) * ends[kept]
-        found.append(_Steps(place[:, 0], place[:, 1]))
+        found.append(
+            _Steps(
+                place[:, 0] + slants[k, 0],
+                place[:, 1] + slants[k, 1],
+                float(strength[which[kept], row[kept]].sum()),
+            )
+        )
     return found
 
 
@@ -176,7 +201,7 @@ def _innermost(steps: _Steps, opposite: _Steps | None) -> int | None:
     for n in range(len(place) - 1, -1, -1):
         if n == 0 or place[n] - place[n - 1] < GAP:
             return n
-        if opposite is not None and np.any(np.abs(opposite.middle - place[n]) < 0.2 * abs(place[n]) + 0.004):
+        if opposite is not None and np.any(np.abs(opposite.middle - place[n]) < 0.3 * abs(place[n]) + 0.004):
             return n
     return None
 
@@ -210,7 +235,7 @@ def _fitted(image: Image, corners: Array, border: Mask, reach: float) -> Edges:
         bend = before - 2.0 * middle + after
         shift = np.where(bend < -1e-3, 0.5 * (before - after) / np.where(bend < -1e-3, bend, -1.0), 0.0)
         at = v[best] + 0.5 * np.clip(shift, -1, 1)
-        good = middle > max(3.0, 0.3 * float(np.median(middle)))
+        good = middle > max(3.0, 0.3 * _middle(middle))
         seen[side] = good.mean()
         if good.sum() < 8:
             continue
@@ -228,9 +253,9 @@ def _rough_line(step: Float, t: Array, v: Array) -> tuple[tuple[float, float], A
         a and b of v = a + b t, and the unit colour (3,) along which the picture gets brighter there, going in;
         None: no edge.
     """
-    pieces = np.median(step.reshape(len(v), PIECES, -1, 3), 2)
+    pieces = np.sort(step.reshape(len(v), PIECES, -1, 3), 2)[:, :, ALONG // PIECES // 2]
     size = np.abs(pieces).max(2)
-    typical = float(np.median(size.max(0)))
+    typical = _middle(size.max(0))
     if typical < 2.0:
         return None
     peak = (size[1:-1] >= size[:-2]) & (size[1:-1] >= size[2:]) & (size[1:-1] > max(2.0, 0.15 * typical))
@@ -241,7 +266,10 @@ def _rough_line(step: Float, t: Array, v: Array) -> tuple[tuple[float, float], A
     middle = t.reshape(PIECES, -1).mean(1)[usable]
     row = row[usable]
     a, b, _ = _robust(middle, v[row])
-    colour = np.median(pieces[row, usable][np.abs(v[row] - a - b * middle) < 1.5], 0)
+    on_line = pieces[row, usable][np.abs(v[row] - a - b * middle) < 1.5]
+    if not len(on_line):
+        return None
+    colour = np.sort(on_line, 0)[len(on_line) // 2]
     length = float(np.linalg.norm(colour))
     return ((a, b), colour / length) if length > 0.5 else None
 
@@ -249,16 +277,21 @@ def _rough_line(step: Float, t: Array, v: Array) -> tuple[tuple[float, float], A
 def _robust(t: Array, y: Array) -> tuple[float, float, float]:
     """y = a + b t by reweighted least squares (Tukey), started from a median of slopes; and the spread."""
     half = len(t) // 2
-    slopes = (y[half : 2 * half] - y[:half]) / (t[half : 2 * half] - t[:half])
-    b = float(np.median(slopes))
-    a = float(np.median(y - b * t))
+    b = _middle((y[half : 2 * half] - y[:half]) / (t[half : 2 * half] - t[:half]))
+    a = _middle(y - b * t)
     scale = 1.0
-    for _ in range(5):
+    for _ in range(4):
         off = y - a - b * t
-        scale = max(1.4826 * float(np.median(np.abs(off))), 0.1)
+        scale = max(1.4826 * _middle(np.abs(off)), 0.1)
         weight = np.maximum(1.0 - (off / (4.0 * scale)) ** 2, 0.0) ** 2
         total = weight.sum()
-        tm, ym = (weight @ t) / total, (weight @ y) / total
-        b = float((weight * (t - tm)) @ (y - ym) / max((weight * (t - tm)) @ (t - tm), 1e-9))
-        a = float(ym - b * tm)
+        tm, ym = float(weight @ t) / total, float(weight @ y) / total
+        lean = weight * (t - tm)
+        b = float(lean @ (y - ym)) / max(float(lean @ (t - tm)), 1e-9)
+        a = ym - b * tm
     return a, b, scale
+
+
+def _middle(x: Array) -> float:
+    """A median; numpy's own takes longer than all the rest on a few numbers."""
+    return float(np.sort(x)[len(x) // 2])

@@ -94,8 +94,12 @@ def _level(board: Image, inside: Image) -> Image:
     height, width = inside.shape
     scale = max(1.0, max(height, width) / 80.0)
     size = (max(8, round(width / scale)), max(8, round(height / scale)))
-    small = cv2.resize(board, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    part = cv2.resize(inside, size, interpolation=cv2.INTER_AREA).astype(np.float32)[..., None] / 255.0
+    # every third pixel is enough for means of many
+    small = cv2.resize(board[1::3, 1::3], size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    part = (
+        cv2.resize(inside[1::3, 1::3], size, interpolation=cv2.INTER_AREA).astype(np.float32)[..., None]
+        / 255.0
+    )
     full = np.where(part > 0.5, small / np.maximum(part, 0.5), 0.0)
     # fill the outside from within, by wider and wider means
     for k in (9, 33, 129):

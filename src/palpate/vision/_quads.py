@@ -20,7 +20,7 @@ CORNER = 12.0
 """how far around a corner its sides are looked at [pixels]"""
 OUT_OF_VIEW = 0.5
 """support that the picture's border is taken to give a side"""
-SHORTLIST = 160
+SHORTLIST = 128
 """quadrangles looked at more closely"""
 GRID = 12
 """points per direction at which the inside is looked at"""

@@ -137,7 +137,7 @@ class Camera:
 def charuco(
     squares: tuple[int, int] = (7, 5), square: float = 0.04, marker: float = 0.03
 ) -> cv2.aruco.CharucoBoard:
-    """The calibration board, DICT_5X5_100: `squares` across and down, of side `square`, markers of side `marker` [m]."""
+    """The calibration board (DICT_5X5_100): so many `squares` across and down of side `square`, with markers [m]."""
     if min(squares) < 3 or not 0.0 < marker < square:
         raise InputError(
             f"ChArUco board: expected at least 3x3 squares and 0 < marker < square, got {squares}, marker {marker} m, "
