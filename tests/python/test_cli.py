@@ -33,6 +33,7 @@ VERBS = (
     "doctor",
     "arm",
     "data",
+    "see",
 )
 
 

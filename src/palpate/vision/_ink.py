@@ -8,7 +8,7 @@ the surface's usual level around it, which ink falls below and a gap does not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -30,6 +30,8 @@ RIM = 0.025
 """what touches the border and stays within this, relative to the board's shorter side, belongs to the frame"""
 THING = 0.016
 """half width from which a filled piece is a thing rather than a stroke, relative to the board's shorter side"""
+DARK = 0.5
+"""a thing wider than a stroke takes away this part of the light at least, in one colour: no shadow is so deep"""
 SPECK = 9
 """smallest connected piece [pixels]"""
 
@@ -74,7 +76,18 @@ def find(image: Image, corners: Array) -> Ink:
     faint = max(255.0 * FAINT, middle + SIGMAS * noise)
     clear = max(255.0 * CLEAR, middle + 1.6 * SIGMAS * noise)
     weak = ((taken > faint) & (below > 255.0 * BELOW) & (inside > 0)).astype(np.uint8)
-    return _pieces(weak, taken, clear, corners - low, low, (height, width), shorter, edge / 2.0)
+    things = _things(below, inside, size)
+    ink = _pieces(weak, taken, things, clear, corners - low, low, (height, width), shorter, edge / 2.0)
+    found, _ = cv2.findContours(things, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    solid = tuple(3.0 * f.reshape(-1, 2) + 1.0 + low for f in found)
+    return replace(ink, objects=ink.objects + solid)
+
+
+def _things(below: Image, inside: Image, size: int) -> Image:
+    """Where something wider than any stroke covers the surface, in every third pixel."""
+    dark = ((below[1::3, 1::3] > 255.0 * DARK) & (inside[1::3, 1::3] > 0)).astype(np.uint8)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size // 3 + 1, size // 3 + 1))
+    return cv2.morphologyEx(dark, cv2.MORPH_OPEN, disc)
 
 
 def _shape(corners: Array) -> float:
@@ -113,6 +126,7 @@ def _level(board: Image, inside: Image) -> Image:
 def _pieces(
     weak: Image,
     taken: Image,
+    things: Image,
     clear: float,
     corners: Array,
     low: Array,
@@ -145,7 +159,12 @@ def _pieces(
     nearest, deepest = np.minimum.reduceat(inward, begin), np.maximum.reduceat(inward, begin)
     # shadow, dirt and rest of the frame: it touches the border and stays beside it
     rim = (nearest < margin + 3.0) & (deepest < max(4.0, RIM * shorter))
-    good = (hits >= np.maximum(3.0, 0.1 * area)) & (area >= SPECK) & ~rim
+    # the rim of a thing
+    around = cv2.dilate(things, np.ones((3, 3), np.uint8))
+    last = np.array(around.shape[::-1]) - 1
+    at = np.minimum(points // 3, last)
+    beside = np.add.reduceat(around[at[:, 1], at[:, 0]].astype(np.float32), begin) > 0.3 * area
+    good = (hits >= np.maximum(3.0, 0.1 * area)) & (area >= SPECK) & ~rim & ~beside
     wide = THING * shorter + 1.5
     outlines, filled = {}, np.zeros(len(good))
     for i in np.flatnonzero(good):
