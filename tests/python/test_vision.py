@@ -65,7 +65,7 @@ def plain():
     return picture()
 
 
-# --- where the board is ------------------------------------------------------------------------------------------------
+# --- where the board is ----------------------------------------------------------------------------------------------
 
 
 def test_corners_are_those_of_the_surface_inside_the_frame(plain):
@@ -163,7 +163,7 @@ def test_a_scene_is_its_seed():
     assert not _boards.scene(3, dirty=False).ink.any()
 
 
-# --- the ink -----------------------------------------------------------------------------------------------------------
+# --- the ink ---------------------------------------------------------------------------------------------------------
 
 
 def test_ink_lies_where_it_was_drawn_in_metres(plain):
@@ -201,7 +201,7 @@ def test_ink_alone_needs_corners(plain):
     assert vision.ink(plain, VIEW).mask.sum() > 1000
 
 
-# --- before and after --------------------------------------------------------------------------------------------------
+# --- before and after ------------------------------------------------------------------------------------------------
 
 
 def test_what_was_erased_is_told_under_other_light_and_behind_an_arm(plain):
@@ -239,7 +239,7 @@ def test_compare_says_what_is_wrong(plain):
         vision.compare(plain, plain, VIEW, VIEW, ignore=np.zeros((3, 3)))
 
 
-# --- the camera --------------------------------------------------------------------------------------------------------
+# --- the camera ------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -366,7 +366,7 @@ def test_a_camera_serves_other_resolutions_but_no_crops(camera):
         vision.Camera(np.eye(3), np.zeros(5), (640, 480), 2.0 * np.eye(4))
 
 
-# --- the published method ----------------------------------------------------------------------------------------------
+# --- the published method --------------------------------------------------------------------------------------------
 
 
 def test_the_published_method_finds_an_evenly_coloured_rectangle():
@@ -391,14 +391,14 @@ def test_the_published_checks():
     square = np.array([[0.0, 0], [10, 0], [10, 10], [0, 10]])
     assert published.rectangular(square, (1.0, 2.0), 20.0)
     assert not published.rectangular(square * [3, 1], (1.0, 2.0), 20.0)
-    assert not published.rectangular(square + [[0, 0], [0, 0], [6, 0], [6, 0]], (1.0, 2.0), 20.0)
+    assert not published.rectangular(square + np.array([[0, 0], [0, 0], [6, 0], [6, 0]]), (1.0, 2.0), 20.0)
 
 
 def test_hue_is_noise_on_white(plain):
     assert vision.see(plain, method="published").board is None
 
 
-# --- wrong input, and the command --------------------------------------------------------------------------------------
+# --- wrong input, and the command ------------------------------------------------------------------------------------
 
 
 def test_what_is_no_picture_is_told(tmp_path):
@@ -478,7 +478,7 @@ def test_palpate_see_says_why_it_cannot(command, plain):
     assert open("notes.png").read() == "mine"
 
 
-# --- the photographs ---------------------------------------------------------------------------------------------------
+# --- the photographs -------------------------------------------------------------------------------------------------
 
 
 def photographs():

@@ -15,7 +15,7 @@ from ..arm import Array
 from ._image import Float, Image
 
 QUANTUM = 1.2
-"""error of a grey level that the segment detector reckons with; its own default, 2, is for pictures that were not shrunk"""
+"""error of a grey level that the segment detector reckons with; its own default, 2, is for pictures not shrunk"""
 SEGMENT = 7.0
 """shortest segment used [pixels]"""
 SEEDS = 100

@@ -63,15 +63,16 @@ def detect(image: npt.ArrayLike, *, most: int = 3) -> tuple[Board, ...]:
     grey = cv2.cvtColor(rough, cv2.COLOR_BGR2GRAY)
     quads = _quads.find(_lines.find(grey, LINES), _lines.gradient(grey), rough, grey)
     boards: list[Board] = []
-    taken: list[Array] = []
+    taken = np.zeros(grey.shape, bool)
     for i in range(len(quads.score)):
         confidence = float(1.0 / (1.0 + np.exp(-quads.score[i])))
         if confidence < SURE or len(boards) == most:
             break
-        if any(_overlap(quads.corners[i], other) > 0.1 for other in taken):
+        inside = _filled(quads.corners[i], grey.shape)
+        if taken.any() and taken[inside].mean() > 0.1:
             continue
         edges = _edges.fit(fine, rescaled(quads.corners[i], 1.0 / scale), quads.border[i])
-        taken.append(quads.corners[i])
+        taken |= inside
         turn = int(np.argmin(edges.corners.sum(1)))
         boards.append(
             Board(
@@ -84,8 +85,8 @@ def detect(image: npt.ArrayLike, *, most: int = 3) -> tuple[Board, ...]:
     return tuple(boards)
 
 
-def _overlap(a: Array, b: Array) -> float:
-    """Common area over the smaller one's."""
-    p, q = a.astype(np.float32), b.astype(np.float32)
-    common, _ = cv2.intersectConvexConvex(p, q)
-    return float(common) / max(min(cv2.contourArea(p), cv2.contourArea(q)), 1.0)
+def _filled(corners: Array, shape: tuple[int, ...]) -> Mask:
+    """The inside of a quadrangle as a mask."""
+    mask = np.zeros(shape, np.uint8)
+    cv2.fillConvexPoly(mask, np.rint(corners * 16.0).astype(np.int32), 1, shift=4)
+    return mask > 0
