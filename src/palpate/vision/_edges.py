@@ -25,6 +25,8 @@ FAINT = 0.12
 """an edge is at least so strong, relative to the strongest along its side"""
 GAP = 0.08
 """a frame shows an edge at least every so often, relative to the board"""
+BOW = 0.4
+"""a side is straight if its middle is nearer to its chord [pixels]"""
 MOST = 0.6
 """part of the pieces in which an edge must be seen"""
 
@@ -207,50 +209,77 @@ def _innermost(steps: _Steps, opposite: _Steps | None) -> int | None:
 
 
 def _fitted(image: Image, corners: Array, border: Mask, reach: float) -> Edges:
-    """Lines through the strongest step within `reach` pixels of each side."""
-    lines = np.zeros((4, 3))
+    """Curves through the step nearest to each side, within `reach` pixels, and where they meet."""
+    sides: list[tuple[Array, Array, Array]] = []
     seen, spread = np.ones(4), np.zeros(4)
     for side in range(4):
         p, q = corners[side], corners[(side + 1) % 4]
         inward = _normal(p, q)
-        lines[side] = *inward, inward @ p
-        if border[side]:
-            continue
-        t = np.linspace(0.04, 0.96, ALONG)
-        v = np.arange(-reach - 1.5, reach + 1.6, 0.5)
-        points = (p + t[:, None] * (q - p))[None] + v[:, None, None] * inward
-        level = cv2.blur(_sampled(image, points), (3, 3))
-        step = level[2:] - level[:-2]
-        v = v[1:-1]
-        line = _rough_line(step, t, v)
-        if line is None:
+        found = None if border[side] else _side(image, p, q, inward, reach)
+        curve = np.zeros(3)
+        if found is not None:
+            curve, seen[side], spread[side] = found
+        elif not border[side]:
             seen[side] = 0.0
-            continue
-        (a, b), colour = line
-        step = step @ colour
-        score = np.where(np.abs(v[:, None] - (a + b * t)) <= 1.6, step, -np.inf)
-        best = score[1:-1].argmax(0) + 1
-        columns = np.arange(ALONG)
-        middle, before, after = (step[best + k, columns] for k in (0, -1, 1))
-        bend = before - 2.0 * middle + after
-        shift = np.where(bend < -1e-3, 0.5 * (before - after) / np.where(bend < -1e-3, bend, -1.0), 0.0)
-        at = v[best] + 0.5 * np.clip(shift, -1, 1)
-        good = middle > max(3.0, 0.3 * _middle(middle))
-        seen[side] = good.mean()
-        if good.sum() < 8:
-            continue
-        a, b, spread[side] = _robust(t[good], at[good])
-        begin, end = p + a * inward, q + (a + b) * inward
-        normal = _normal(begin, end)
-        lines[side] = *normal, normal @ begin
-    return Edges(_met(lines), seen, spread)
+        # the point at t is x + t (y - x) + t^2 z
+        sides.append((p + curve[0] * inward, q + (curve[0] + curve[1]) * inward, curve[2] * inward))
+    return Edges(np.array([_corner(sides[k - 1], sides[k]) for k in range(4)]), seen, spread)
 
 
-def _rough_line(step: Float, t: Array, v: Array) -> tuple[tuple[float, float], Array] | None:
+def _corner(before: tuple[Array, Array, Array], after: tuple[Array, Array, Array]) -> Array:
+    """Where the end of one side meets the begin of the next."""
+    t = np.array([1.0, 0.0])
+    for _ in range(4):  # Newton; straight sides need one step
+        (x, y, z), (u, v, w) = before, after
+        here = x + t[0] * (y - x) + t[0] ** 2 * z
+        there = u + t[1] * (v - u) + t[1] ** 2 * w
+        slope = np.stack([y - x + 2.0 * t[0] * z, u - v - 2.0 * t[1] * w], 1)
+        t = t - np.linalg.solve(slope, here - there)
+    u, v, w = after
+    return u + t[1] * (v - u) + t[1] ** 2 * w
+
+
+def _side(image: Image, p: Array, q: Array, inward: Array, reach: float) -> tuple[Array, float, float] | None:
+    """The step nearest to the line from p to q.
+
+    Returns:
+        its distance from the line at t = 0 to 1 as the coefficients (3,) of 1, t and t^2 [pixels], the part of the side
+        where it is seen, and the deviation from that curve [pixels]; None: there is none.
+    """
+    t = np.linspace(0.04, 0.96, ALONG)
+    v = np.arange(-reach - 1.5, reach + 1.6, 0.5)
+    points = (p + t[:, None] * (q - p))[None] + v[:, None, None] * inward
+    level = cv2.blur(_sampled(image, points), (3, 3))
+    step = level[2:] - level[:-2]
+    v = v[1:-1]
+    rough = _rough_line(step, t, v)
+    if rough is None:
+        return None
+    curve, colour = rough
+    step = step @ colour
+    score = np.where(np.abs(v[:, None] - _at(curve, t)) <= 1.6, step, -np.inf)
+    best = score[1:-1].argmax(0) + 1
+    columns = np.arange(ALONG)
+    middle, before, after = (step[best + k, columns] for k in (0, -1, 1))
+    bend = before - 2.0 * middle + after
+    shift = np.where(bend < -1e-3, 0.5 * (before - after) / np.where(bend < -1e-3, bend, -1.0), 0.0)
+    place = v[best] + 0.5 * np.clip(shift, -1, 1)
+    good = middle > max(3.0, 0.3 * _middle(middle))
+    if good.sum() < 8:
+        return None
+    curve, spread = _curve(t[good], place[good])
+    return curve, float(good.mean()), spread
+
+
+def _at(curve: Array, t: Array) -> Array:
+    return curve[0] + t * (curve[1] + t * curve[2])
+
+
+def _rough_line(step: Float, t: Array, v: Array) -> tuple[Array, Array] | None:
     """The edge nearest to the middle in steps (rows, ALONG, 3) at distances v.
 
     Returns:
-        a and b of v = a + b t, and the unit colour (3,) along which the picture gets brighter there, going in;
+        coefficients (3,) of v in t, and the unit colour (3,) along which the picture gets brighter there, going in;
         None: no edge.
     """
     pieces = np.sort(step.reshape(len(v), PIECES, -1, 3), 2)[:, :, ALONG // PIECES // 2]
@@ -265,31 +294,40 @@ def _rough_line(step: Float, t: Array, v: Array) -> tuple[tuple[float, float], A
         return None
     middle = t.reshape(PIECES, -1).mean(1)[usable]
     row = row[usable]
-    a, b, _ = _robust(middle, v[row])
-    on_line = pieces[row, usable][np.abs(v[row] - a - b * middle) < 1.5]
+    curve, _ = _curve(middle, v[row])
+    on_line = pieces[row, usable][np.abs(v[row] - _at(curve, middle)) < 1.5]
     if not len(on_line):
         return None
     colour = np.sort(on_line, 0)[len(on_line) // 2]
     length = float(np.linalg.norm(colour))
-    return ((a, b), colour / length) if length > 0.5 else None
+    return (curve, colour / length) if length > 0.5 else None
 
 
-def _robust(t: Array, y: Array) -> tuple[float, float, float]:
-    """y = a + b t by reweighted least squares (Tukey), started from a median of slopes; and the spread."""
+def _curve(t: Array, y: Array) -> tuple[Array, float]:
+    """y in t by reweighted least squares (Tukey), started from a median of slopes, and the spread.
+
+    A line; a parabola where a line leaves clearly more (a lens bends straight edges).
+    """
     half = len(t) // 2
     b = _middle((y[half : 2 * half] - y[:half]) / (t[half : 2 * half] - t[:half]))
-    a = _middle(y - b * t)
+    line, spread = _reweighted(t, y, np.array([_middle(y - b * t), b, 0.0]), 2)
+    if len(t) < 10:
+        return line, spread
+    parabola, left = _reweighted(t, y, line, 3)
+    bowed = 0.25 * abs(parabola[2]) > BOW and left < 0.8 * spread
+    return (parabola, left) if bowed else (line, spread)
+
+
+def _reweighted(t: Array, y: Array, curve: Array, terms: int) -> tuple[Array, float]:
+    basis = np.stack([np.ones_like(t), t, t * t][:terms], 1)
     scale = 1.0
     for _ in range(4):
-        off = y - a - b * t
+        off = y - _at(curve, t)
         scale = max(1.4826 * _middle(np.abs(off)), 0.1)
-        weight = np.maximum(1.0 - (off / (4.0 * scale)) ** 2, 0.0) ** 2
-        total = weight.sum()
-        tm, ym = float(weight @ t) / total, float(weight @ y) / total
-        lean = weight * (t - tm)
-        b = float(lean @ (y - ym)) / max(float(lean @ (t - tm)), 1e-9)
-        a = ym - b * tm
-    return a, b, scale
+        weighted = basis * np.maximum(1.0 - (off / (4.0 * scale)) ** 2, 0.0)[:, None] ** 2
+        curve = np.zeros(3)
+        curve[:terms] = np.linalg.solve(weighted.T @ basis + 1e-9 * np.eye(terms), weighted.T @ y)
+    return curve, scale
 
 
 def _middle(x: Array) -> float:
