@@ -311,7 +311,7 @@ def _curve(t: Array, y: Array) -> tuple[Array, float]:
     half = len(t) // 2
     b = _middle((y[half : 2 * half] - y[:half]) / (t[half : 2 * half] - t[:half]))
     line, spread = _reweighted(t, y, np.array([_middle(y - b * t), b, 0.0]), 2)
-    if len(t) < 10:
+    if len(t) < 10 or spread < 0.5 * BOW:  # a sum of noise and bow cannot be less than the bow
         return line, spread
     parabola, left = _reweighted(t, y, line, 3)
     bowed = 0.25 * abs(parabola[2]) > BOW and left < 0.8 * spread
@@ -321,7 +321,7 @@ def _curve(t: Array, y: Array) -> tuple[Array, float]:
 def _reweighted(t: Array, y: Array, curve: Array, terms: int) -> tuple[Array, float]:
     basis = np.stack([np.ones_like(t), t, t * t][:terms], 1)
     scale = 1.0
-    for _ in range(4):
+    for _ in range(3):
         off = y - _at(curve, t)
         scale = max(1.4826 * _middle(np.abs(off)), 0.1)
         weighted = basis * np.maximum(1.0 - (off / (4.0 * scale)) ** 2, 0.0)[:, None] ** 2
