@@ -52,9 +52,7 @@ def run(
     quiet: Quiet = False,
 ) -> int:
     """See."""
-    import cv2
-
-    from ..vision import METHODS, Camera, annotated, load, see
+    from ..vision import METHODS, Camera, annotated, load, png, see
 
     chosen = next((m for m in METHODS if m == method), None)
     if chosen is None:
@@ -70,7 +68,7 @@ def run(
             f"{image}: no whiteboard found ({method}): expected four straight edges around an even light surface, "
             "all of it in view but at most one side"
         )
-    write_file(target, cv2.imencode(".png", annotated(picture, sight))[1].tobytes())
+    write_file(target, png(annotated(picture, sight)))
     if json:
         emit({**sight.plain(), "method": method, "picture": str(target)})
         return 0

@@ -16,7 +16,7 @@ except ImportError:
 
     raise MissingExtraError("vision", "seeing a whiteboard") from None
 
-from ._image import load
+from ._image import load, png
 from ._ink import Ink
 from .board import Board, detect
 from .camera import Camera, Plane, aspect, calibrate_charuco, calibrate_poses, charuco, plane
@@ -47,5 +47,6 @@ __all__ = [
     "ink",
     "load",
     "plane",
+    "png",
     "see",
 ]

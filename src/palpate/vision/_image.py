@@ -42,6 +42,11 @@ def load(path: str | PathLike[str]) -> Image:
     return checked(image, str(file))
 
 
+def png(image: Image) -> bytes:
+    """A picture (H, W, 3) BGR as a PNG file."""
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
 def checked(image: npt.ArrayLike, name: str = "image") -> Image:
     """The picture as (H, W, 3) BGR; grey pictures get three equal channels, an alpha channel is dropped.
 
