@@ -76,18 +76,27 @@ def find(image: Image, corners: Array) -> Ink:
     faint = max(255.0 * FAINT, middle + SIGMAS * noise)
     clear = max(255.0 * CLEAR, middle + 1.6 * SIGMAS * noise)
     weak = ((taken > faint) & (below > 255.0 * BELOW) & (inside > 0)).astype(np.uint8)
-    things = _things(below, inside, size)
+    things = _things(below, inside, weak, size)
     ink = _pieces(weak, taken, things, clear, corners - low, low, (height, width), shorter, edge / 2.0)
     found, _ = cv2.findContours(things, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     solid = tuple(3.0 * f.reshape(-1, 2) + 1.0 + low for f in found)
     return replace(ink, objects=ink.objects + solid)
 
 
-def _things(below: Image, inside: Image, size: int) -> Image:
-    """Where something wider than any stroke covers the surface, in every third pixel."""
+def _things(below: Image, inside: Image, weak: Image, size: int) -> Image:
+    """Where something wider than any stroke covers the surface, in every third pixel.
+
+    Not where most of it is `weak`, that is narrow enough to be judged as a piece.
+    """
     dark = ((below[1::3, 1::3] > 255.0 * DARK) & (inside[1::3, 1::3] > 0)).astype(np.uint8)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size // 3 + 1, size // 3 + 1))
-    return cv2.morphologyEx(dark, cv2.MORPH_OPEN, disc)
+    solid = cv2.morphologyEx(dark, cv2.MORPH_OPEN, disc)
+    count, label = cv2.connectedComponents(solid)
+    if count > 1:
+        names = label.ravel()
+        narrow = np.bincount(names, weak[1::3, 1::3].ravel(), count) / np.bincount(names, minlength=count)
+        solid[narrow[label] > 0.8] = 0
+    return solid
 
 
 def _shape(corners: Array) -> float:
