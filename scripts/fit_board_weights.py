@@ -5,7 +5,7 @@
 Every candidate of a view is fitted to the board's edges; it is right if all corners come within 4 pixels. The weights
 rank a right candidate before all wrong ones (softmax), and the bias separates views with a right best candidate from
 rooms without a board (logistic). They are kept near those in use. Every tenth picture is a room without a board; the
-first half of the pictures is fitted and the second half judged, and the other way round, before all are fitted. No
+even pictures are fitted and the odd ones judged, and the other way round, before all are fitted. No
 photograph takes part. Takes about a second a view; needs palpate[vision,identify].
 """
 
