@@ -43,7 +43,21 @@ def _start(
         typer.echo(context.get_help())
 
 
-for module in (weigh, feel, simulate, replay, tare, identify, excite, arm, see, reproduce, bench, data, doctor):
+for module in (
+    weigh,
+    feel,
+    simulate,
+    replay,
+    tare,
+    identify,
+    excite,
+    arm,
+    see,
+    reproduce,
+    bench,
+    data,
+    doctor,
+):
     module.add(app)
 
 

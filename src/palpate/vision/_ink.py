@@ -77,7 +77,7 @@ def find(image: Image, corners: Array) -> Ink:
     clear = max(255.0 * CLEAR, middle + 1.6 * SIGMAS * noise)
     weak = ((taken > faint) & (below > 255.0 * BELOW) & (inside > 0)).astype(np.uint8)
     things = _things(below, inside, weak, size)
-    ink = _pieces(weak, taken, things, clear, corners - low, low, (height, width), shorter, edge / 2.0)
+    ink = _pieces(weak, taken, below, things, clear, corners - low, low, (height, width), shorter, edge / 2.0)
     found, _ = cv2.findContours(things, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     solid = tuple(3.0 * f.reshape(-1, 2) + 1.0 + low for f in found)
     return replace(ink, objects=ink.objects + solid)
@@ -135,6 +135,7 @@ def _level(board: Image, inside: Image) -> Image:
 def _pieces(
     weak: Image,
     taken: Image,
+    below: Image,
     things: Image,
     clear: float,
     corners: Array,
@@ -184,9 +185,9 @@ def _pieces(
         outlines[i] = piece, (line + low + np.array([x, y])).astype(np.float64)
         if radius[i] > wide:
             # without what blur adds around it, and without what joins letters that run together
-            solid = cv2.findNonZero(
-                piece * (taken[y : y + h, x : x + w] > 153.0 * strength[i]).astype(np.uint8)
-            )
+            dark = below[y : y + h, x : x + w]
+            core = 0.6 * float(np.percentile(dark[piece > 0], 90))
+            solid = cv2.findNonZero(piece * (dark > core).astype(np.uint8))
             filled[i] = len(solid) / max(cv2.contourArea(cv2.convexHull(solid)), 1.0)
     # half of the ink is in pieces at most so thick; a filled piece tells nothing of a pen's width
     drawn = np.flatnonzero(good & (filled < 0.6))
