@@ -33,6 +33,7 @@ VERBS = (
     "doctor",
     "arm",
     "data",
+    "see",
 )
 
 
@@ -317,6 +318,7 @@ def test_a_bug_says_that_it_is_one(palpate, monkeypatch: pytest.MonkeyPatch) -> 
         ("mujoco", "weigh --no-report --no-record", "sim"),
         ("matplotlib", "weigh --duration 1 --no-record", "report"),
         ("yaml", "weigh --duration 1", "card"),
+        ("cv2", "see photo.png", "vision"),
     ],
 )
 def test_a_missing_extra_is_one_line_with_the_pip_install(

@@ -16,7 +16,14 @@ from recordings import recording
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("[0-9][0-9]_*.py"))
 NUMBER = re.compile(r"-?\d+\.?\d*")
-EXTRAS = {"sim": "mujoco", "logs": "rosbags", "card": "yaml", "data": "pooch", "identify": "scipy"}
+EXTRAS = {
+    "sim": "mujoco",
+    "logs": "rosbags",
+    "card": "yaml",
+    "data": "pooch",
+    "identify": "scipy",
+    "vision": "cv2",
+}
 
 
 def promised(script: Path) -> list[str]:

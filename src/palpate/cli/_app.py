@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from . import arm, bench, data, doctor, excite, feel, identify, replay, reproduce, simulate, tare, weigh
+from . import arm, bench, data, doctor, excite, feel, identify, replay, reproduce, see, simulate, tare, weigh
 
 app = typer.Typer(
     name="palpate",
@@ -43,7 +43,21 @@ def _start(
         typer.echo(context.get_help())
 
 
-for module in (weigh, feel, simulate, replay, tare, identify, excite, arm, reproduce, bench, data, doctor):
+for module in (
+    weigh,
+    feel,
+    simulate,
+    replay,
+    tare,
+    identify,
+    excite,
+    arm,
+    see,
+    reproduce,
+    bench,
+    data,
+    doctor,
+):
     module.add(app)
 
 

@@ -26,6 +26,7 @@ _EXTRAS = {
     "logs": (("rosbags", "lz4"), "compressed bags, any ROS 2 message"),
     "xacro": (("xacro",), "arms from .xacro files"),
     "data": (("pooch",), "palpate data get"),
+    "vision": (("cv2",), "whiteboards in pictures"),
 }
 _DRAW = (
     "from palpate.simulate import Plant; from palpate import robots; "

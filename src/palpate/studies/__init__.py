@@ -106,6 +106,9 @@ _ALL = (
         "accuracy", "Recordings of real robots: identification, drive gains, loads, and the rivals", "bench"
     ),
     Study("replay", "Live, offline, replayed, chunked: the same bits; import time and size", "bench"),
+    Study(
+        "board-detection", "Whiteboards found in rendered views and photographs, and the ink on them", "bench"
+    ),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
 
