@@ -184,7 +184,7 @@ class JointKalman {
       given -= dynamics_->bias_torque(in.load_rest, q_m, v);
     for (int i = 0; i < N; ++i) {
       const palpate::Friction friction = expected_friction(arm, i);
-      slope[i] = friction.derivative(v[i]);
+      slope[i] = std::max(friction.derivative(v[i]), 0.0);
       given[i] -= friction.torque(v[i]);
       theta[i] = weight(h * slope[i] / M(i, i));
       armature[i] = h * theta[i] * slope[i];
@@ -230,7 +230,7 @@ class JointKalman {
       for (int o = 0; o <= p; ++o) P(P0 + o, P0 + p) *= decay_[u(o)] * decay_[u(p)];
     }
     const Square S = Noise * rival::in(in.torque_variance).asDiagonal() * Noise;
-    P.template block<N, N>(0, 0) += ht_.asDiagonal() * S * ht_.asDiagonal();
+    P.template block<N, N>(0, 0) += ht_.asDiagonal() * S * ht_.asDiagonal() + h * h / 12.0 * S;
     P.template block<N, N>(0, N) += ht_.asDiagonal() * S;
     P.template block<N, N>(N, N) += S;
     if constexpr (encoders)

@@ -190,27 +190,9 @@ class JointKalman {
   };
   /// z = x_i + noise of variance R, or z = x_i + x_e + noise where e >= 0.
   Update measure(int i, int e, double z, double R) noexcept {
-    const double* row = P_.data() + i * dim_;
-    for (int c = 0; c < dim_; ++c) p_[u(c)] = row[c];
-    double y = z - x_[u(i)];
-    if (e >= 0) {
-      const double* error = P_.data() + e * dim_;
-      for (int c = 0; c < dim_; ++c) p_[u(c)] += error[c];
-      y -= x_[u(e)];
-    }
-    const double s = p_[u(i)] + (e >= 0 ? p_[u(e)] : 0.0) + R;
-    std::array<double, max_dim> left;  // p - s K: zero but for rounding; keeps the Joseph form's symmetry and sign
-    for (int c = 0; c < dim_; ++c) {
-      K_[u(c)] = p_[u(c)] / s;
-      left[u(c)] = p_[u(c)] - s * K_[u(c)];
-    }
-    for (int r = 0; r < dim_; ++r) {
-      const double Kr = K_[u(r)], lr = left[u(r)];
-      double* P = P_.data() + r * dim_;
-      for (int c = 0; c < dim_; ++c) P[c] -= Kr * p_[u(c)] + lr * K_[u(c)];
-      x_[u(r)] += Kr * y;
-    }
-    return {y, s, K_.data()};
+    const Update update = measure_upper(i, e, z, R);
+    symmetrise();
+    return update;
   }
 
   /// Position measured, velocity unknown within velocity_std, no correlation with the parameters.
@@ -237,10 +219,11 @@ class JointKalman {
       const JointDescription& d = arm.joint(i);
       const int e = encoder_ >= 0 ? 2 * n_ + encoder_ + i : -1;
       // The rounding counts twice, as a state that stays and as noise: it is in truth neither, but a saw-tooth of q.
-      seen(i, e, measure(i, e, sample.q[u(i)], std::max(arm.position_variance(i), least_variance)));
+      seen(i, e, measure_upper(i, e, sample.q[u(i)], std::max(arm.position_variance(i), least_variance)));
       if (sample.velocity_measured && std::isfinite(d.velocity_std))
-        seen(n_ + i, -1, measure(n_ + i, -1, sample.dq[u(i)], std::max(d.velocity_std * d.velocity_std, least_variance)));
+        seen(n_ + i, -1, measure_upper(n_ + i, -1, sample.dq[u(i)], std::max(d.velocity_std * d.velocity_std, least_variance)));
     }
+    symmetrise();
   }
 
   /// X of the last prediction, the part that is not zero (for tests).
@@ -297,6 +280,33 @@ class JointKalman {
   void transpose() noexcept {
     for (int r = 0; r < dim_; ++r)
       for (int c = r + 1; c < dim_; ++c) std::swap(T_[u(r * dim_ + c)], T_[u(c * dim_ + r)]);
+  }
+  /// measure() on the upper triangle of P; symmetrise() after the last.
+  Update measure_upper(int i, int e, double z, double R) noexcept {
+    const auto add_row = [this](int row) {
+      for (int c = 0; c < row; ++c) p_[u(c)] += P_[u(c * dim_ + row)];
+      for (int c = row; c < dim_; ++c) p_[u(c)] += P_[u(row * dim_ + c)];
+    };
+    double y = z - x_[u(i)];
+    std::fill_n(p_.begin(), dim_, 0.0);
+    add_row(i);
+    if (e >= 0) {
+      add_row(e);
+      y -= x_[u(e)];
+    }
+    const double s = p_[u(i)] + (e >= 0 ? p_[u(e)] : 0.0) + R;
+    const double scale = 1.0 / std::sqrt(s);  // P -= u u^T with u = p/sqrt(s): what is taken away is never negative
+    for (int c = 0; c < dim_; ++c) {
+      K_[u(c)] = p_[u(c)] / s;
+      p_[u(c)] *= scale;
+    }
+    for (int r = 0; r < dim_; ++r) {
+      const double ur = p_[u(r)];
+      double* P = P_.data() + r * dim_;
+      for (int c = r; c < dim_; ++c) P[c] -= ur * p_[u(c)];
+      x_[u(r)] += K_[u(r)] * y;
+    }
+    return {y, s, K_.data()};
   }
   void symmetrise() noexcept {
     for (int r = 0; r < dim_; ++r)
