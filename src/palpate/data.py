@@ -3,7 +3,7 @@
 palpate carries no recording, because they are not ours to pass on. :func:`find` serves a file from the first of
 
 1. the folder that the environment variable ``PALPATE_DATA`` names,
-2. ``../shared/data`` beside the checkout, when the program or palpate itself is run from a checkout,
+2. where it names none, ``../shared/data`` beside the checkout, when the program or palpate itself is run from a checkout,
 3. the user's cache, which :func:`get` fills from the original repository (needs ``palpate[data]``),
 
 each laid out as one folder per data set. Every file is checked against its SHA-256 before it is used.
@@ -289,6 +289,7 @@ def _roots() -> Iterator[Path]:
         if not Path(named).is_dir():
             raise LogError(f"{VARIABLE} is {named!r}, which is no folder")
         yield Path(named)
+        return
     for root in (*_above(Path.cwd()), *_above(Path(__file__).resolve().parent)):
         if (root / "src" / "palpate" / "data.py").is_file():
             yield root.parent / "shared" / "data"

@@ -75,13 +75,9 @@ def place(folder: str) -> Path:
     Raises:
         LogError: it is not on this machine.
     """
-    named = os.environ.get(recordings.VARIABLE)
-    above = Path(__file__).resolve().parents
-    for root in (
-        [Path(named)] if named else [p.parent / "shared" / "data" for p in above if (p / "src").is_dir()]
-    ):
-        if (root / folder).is_dir():
-            return root / folder
+    found = recordings.local(folder)
+    if found is not None:
+        return found
     raise LogError(
         f"no recordings {folder!r} on this machine: {recordings.VARIABLE} names the folder with them"
     )
