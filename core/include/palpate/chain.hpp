@@ -18,6 +18,7 @@ template <class T>
 struct Step {
   Mat3<T> R;
   Vec3<T> p;
+  Step() = default;
   Step(const Body& b, const T& q) noexcept {
     if (b.prismatic) {
       R = {lift<T>(b.R.cx), lift<T>(b.R.cy), lift<T>(b.R.cz)};
@@ -38,6 +39,15 @@ Inertia<T> body_inertia(const Arm& arm, int j, const Inertia<T>& load) noexcept 
 }
 
 }  // namespace detail
+
+/// Where every body is in the one before it, at joint positions q: for several calls at one q.
+template <class T>
+struct Placements {
+  Placements(const Arm& arm, const Joints<T>& q) noexcept {
+    for (int j = 0; j < arm.n(); ++j) steps[detail::at(j)] = detail::Step<T>(arm.body(j), q[detail::at(j)]);
+  }
+  std::array<detail::Step<T>, max_joints> steps;
+};
 
 /// The three terms a momentum observer needs.
 template <class T>
@@ -109,10 +119,10 @@ MomentumTerms<T> momentum_terms(const Arm& arm, const Joints<T>& q, const Joints
 
 /// tau = M q'' + C q' + g by Newton-Euler; with q'' = 0 the bias C q' + g.
 template <class T>
-Joints<T> inverse_dynamics(const Arm& arm, const Joints<T>& q, const Joints<T>& dq, const Joints<T>& ddq, const Inertia<T>& load = {}) noexcept {
+Joints<T> inverse_dynamics(const Arm& arm, const Placements<T>& at, const Joints<T>& dq, const Joints<T>& ddq,
+                           const Inertia<T>& load = {}) noexcept {
   struct Link {
-    Mat3<T> R;
-    Vec3<T> p, f, t;
+    Vec3<T> f, t;
   };
   std::array<Link, max_joints> links;
   const int n = arm.n();
@@ -121,12 +131,10 @@ Joints<T> inverse_dynamics(const Arm& arm, const Joints<T>& q, const Joints<T>& 
     const Body& b = arm.body(j);
     const auto u = detail::at(j);
     Link& L = links[u];
-    const detail::Step<T> step(b, q[u]);
-    L.R = step.R;
-    L.p = step.p;
-    a = transposed(L.R, a + cross(dw, L.p) + cross(w, cross(w, L.p)));
-    w = transposed(L.R, w);
-    dw = transposed(L.R, dw);
+    const detail::Step<T>& step = at.steps[u];
+    a = transposed(step.R, a + cross(dw, step.p) + cross(w, cross(w, step.p)));
+    w = transposed(step.R, w);
+    dw = transposed(step.R, dw);
     if (b.prismatic) {
       a = a + Vec3<T>{2.0 * w.y * dq[u], -2.0 * w.x * dq[u], ddq[u]};
     } else {
@@ -145,12 +153,17 @@ Joints<T> inverse_dynamics(const Arm& arm, const Joints<T>& q, const Joints<T>& 
     tau[u] = (b.prismatic ? L.f.z : L.t.z) + b.rotor_inertia * ddq[u];
     if (j > 0) {
       Link& P = links[detail::at(j - 1)];
-      const Vec3<T> f = L.R * L.f;
+      const detail::Step<T>& step = at.steps[u];
+      const Vec3<T> f = step.R * L.f;
       P.f = P.f + f;
-      P.t = P.t + L.R * L.t + cross(L.p, f);
+      P.t = P.t + step.R * L.t + cross(step.p, f);
     }
   }
   return tau;
+}
+template <class T>
+Joints<T> inverse_dynamics(const Arm& arm, const Joints<T>& q, const Joints<T>& dq, const Joints<T>& ddq, const Inertia<T>& load = {}) noexcept {
+  return inverse_dynamics<T>(arm, Placements<T>(arm, q), dq, ddq, load);
 }
 
 /// g(q) [N m].

@@ -62,11 +62,12 @@ class SlidingModeObserver {
     const int steps = substeps(s.dt);
     const double h = s.dt / steps;
     const Cholesky<double> factor(M_, n);
+    const Placements<double> at(*arm_, s.q);
     JointVector injected{};  // integral of alpha sgn e over the sample [rad/s]
     for (int k = 0; k < steps; ++k) {
-      if (config_.solver == Solver::euler) euler(s, h, injected);
-      else if (config_.solver == Solver::rk4) runge_kutta(rk4_, s, h, factor, injected);
-      else runge_kutta(dormand_prince_, s, h, factor, injected);
+      if (config_.solver == Solver::euler) euler(s, at, h, injected);
+      else if (config_.solver == Solver::rk4) runge_kutta(rk4_, s, at, h, factor, injected);
+      else runge_kutta(dormand_prince_, s, at, h, factor, injected);
     }
     bool astray = false, one_sided = false;
     const double weight = -std::expm1(-s.dt / 0.25);
@@ -149,10 +150,10 @@ class SlidingModeObserver {
     }
   }
 
-  void euler(const JointSample& s, double h, JointVector& injected) noexcept {
+  void euler(const JointSample& s, const Placements<double>& at, double h, JointVector& injected) noexcept {
     JointVector dx1{}, z2{};
     injection(s, x1_, x2_, dx1, z2);
-    JointVector r = inverse_dynamics<double>(*arm_, s.q, x2_, JointVector{});
+    JointVector r = inverse_dynamics<double>(*arm_, at, x2_, JointVector{});
     JointMatrix W = M_;
     for (int j = 0; j < arm_->n(); ++j) {
       const auto u = detail::at(j);
@@ -172,7 +173,8 @@ class SlidingModeObserver {
     }
   }
 
-  void runge_kutta(const Tableau& t, const JointSample& s, double h, const Cholesky<double>& factor, JointVector& injected) noexcept {
+  void runge_kutta(const Tableau& t, const JointSample& s, const Placements<double>& at, double h, const Cholesky<double>& factor,
+                   JointVector& injected) noexcept {
     const int n = arm_->n();
     std::array<JointVector, 6> k1{}, k2{}, z2{};
     for (int stage = 0; stage < t.stages; ++stage) {
@@ -184,7 +186,7 @@ class SlidingModeObserver {
           x2[detail::at(j)] += h * t.a[S][p] * k2[p][detail::at(j)];
         }
       injection(s, x1, x2, k1[S], z2[S]);
-      JointVector r = inverse_dynamics<double>(*arm_, s.q, x2, JointVector{});
+      JointVector r = inverse_dynamics<double>(*arm_, at, x2, JointVector{});
       for (int j = 0; j < n; ++j) {
         const auto u = detail::at(j);
         r[u] = s.tau[u] - r[u];
