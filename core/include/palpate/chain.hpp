@@ -44,7 +44,9 @@ Inertia<T> body_inertia(const Arm& arm, int j, const Inertia<T>& load) noexcept 
 template <class T>
 struct Placements {
   Placements(const Arm& arm, const Joints<T>& q) noexcept {
-    for (int j = 0; j < arm.n(); ++j) steps[detail::at(j)] = detail::Step<T>(arm.body(j), q[detail::at(j)]);
+    int j = 0;  // an arm has a joint at least
+    do steps[detail::at(j)] = detail::Step<T>(arm.body(j), q[detail::at(j)]);
+    while (++j < arm.n());
   }
   std::array<detail::Step<T>, max_joints> steps;
 };
