@@ -66,8 +66,7 @@ std::vector<RawSample> sensed(const Arm& arm, const Recording& recording, std::u
 /// Conditioner and filter, as the pipeline joins them.
 class Scale {
  public:
-  /// The links of these arms weigh 0.2 to 5 kg: a prior of 5 kg, which an arm without torque limits gets, would be unfit.
-  explicit Scale(const Arm& arm, const PayloadFilterConfig& config = {.mass_prior_std = 1.0}) : conditioner_(arm.n(), ones()), filter_(arm, config) {}
+  explicit Scale(const Arm& arm, const PayloadFilterConfig& config = {}) : conditioner_(arm.n(), ones()), filter_(arm, config) {}
   Payload step(const RawSample& raw) noexcept { return filter_.step(conditioner_.step(raw)); }
   Payload feed(const std::vector<RawSample>& samples) noexcept {
     Payload out;
@@ -134,7 +133,7 @@ TEST(PayloadFilter, ANegativeLoadIsANumberToo) {  // model or calibration off by
   Scene scene{.seconds = 2.0, .q0 = pose(5)};
   scene.events = [&](double, Plant& plant) { plant.push = palpate_test::weight_torque(arm, plant.q, -0.8); };
   for (bool offset : {false, true}) {
-    Scale scale(arm, {.first_moment = offset, .mass_prior_std = 1.0});
+    Scale scale(arm, {.first_moment = offset});
     Payload seen;
     for (const RawSample& raw : sensed(arm, simulate(arm, scene), 1)) {
       seen = scale.step(raw);
@@ -149,13 +148,13 @@ TEST(PayloadFilter, FindsTheOffsetOfTheLoad) {
   for (std::uint64_t seed = 1; seed <= 5; ++seed) {
     const Arm arm(description(seed));
     const double mass = 0.5;
-    const double tolerance = 0.01;  // the interval of a load that outweighs the last links is a little too narrow [kg m]
+    const double tolerance = 0.01;  // in motion as fast as this the interval is a little too narrow, whatever the prior [kg m]
     const Vec3<double> delta{0.03, -0.04, 0.02};  // tip axes
     Scene scene{.seconds = 4.0, .swing = 1.0, .q0 = pose(5)};
     scene.events = [&](double, Plant& plant) {
       plant.load = about_origin(mass, arm.p_last_grasp() + arm.R_last_tip() * delta, Sym3<double>{});
     };
-    Scale scale(arm, {.first_moment = true, .mass_prior_std = 1.0});
+    Scale scale(arm, {.first_moment = true});
     const Payload seen = scale.feed(sensed(arm, simulate(arm, scene), seed));
     SCOPED_TRACE("arm " + std::to_string(seed));
     EXPECT_NEAR(seen.mass, mass, 3.5 * seen.mass_std + 0.01);
@@ -268,7 +267,7 @@ TEST(PayloadFilter, InfinityDeclaresNoChange) {
   const Arm arm(description(1));
   Scene scene{.seconds = 3.0, .q0 = pose(5)};
   scene.events = [&](double t, Plant& plant) { plant.load = palpate_test::point_load(arm, t >= 1.5 ? 0.7 : 0.0); };
-  Scale scale(arm, {.mass_prior_std = 1.0, .change_threshold = inf});
+  Scale scale(arm, {.change_threshold = inf});
   EXPECT_EQ(scale.feed(sensed(arm, simulate(arm, scene), 1)).changes, 0u);
 }
 
@@ -285,12 +284,8 @@ TEST(PayloadFilter, AQuietRunHasNoChanges) {
     Scene scene{.seconds = 12.0, .swing = seed < 3 ? 0.4 : 0.0, .q0 = pose(5)};
     scene.events = [&](double, Plant& plant) { plant.load = palpate_test::point_load(arm, 0.5); };
     Scale scale(arm);
-    std::vector<RawSample> start = sensed(arm, simulate(arm, scene), seed);
-    const std::vector<RawSample> rest(start.begin() + 250, start.end());
-    start.resize(250);
-    const std::uint32_t learning = scale.feed(start).changes;  // a first guess may be corrected
-    const Payload seen = scale.feed(rest);
-    EXPECT_EQ(seen.changes, learning) << "arm " << seed;
+    const Payload seen = scale.feed(sensed(arm, simulate(arm, scene), seed));
+    EXPECT_EQ(seen.changes, 0u) << "arm " << seed;
     EXPECT_NEAR(seen.mass, 0.5, 4.0 * seen.mass_std + 0.01) << "arm " << seed;
   }
 }
@@ -350,7 +345,7 @@ TEST(PayloadFilter, SurvivesWhatTheConditionerLetsThrough) {  // absurd but fini
   scene.events = [&](double, Plant& plant) { plant.load = palpate_test::point_load(arm, 0.5); };
   std::vector<RawSample> raw = sensed(arm, simulate(arm, scene), 1);
   for (bool offset : {false, true}) {
-    Scale scale(arm, {.first_moment = offset, .mass_prior_std = 1.0});
+    Scale scale(arm, {.first_moment = offset});
     Payload seen;
     int reset_clock = 0;
     for (std::size_t k = 0; k < raw.size(); ++k) {

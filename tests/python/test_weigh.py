@@ -101,6 +101,29 @@ def test_nothing_in_the_hand_weighs_nothing() -> None:
     assert result.summary()["time_to_2_percent_s"] is None
 
 
+@pytest.mark.parametrize(
+    "name, mass",
+    [
+        ("kuka_lbr_iiwa14", 0.0),
+        ("kuka_lbr_iiwa14", 1.0),
+        ("kuka_lbr_iiwa14", 5.0),
+        ("kuka_lbr_iiwa7", 5.0),
+        ("abb_irb2400_16", 10.0),
+        ("abb_irb2400_16", 20.0),
+        ("justina_left_arm", 1.0),
+    ],
+)
+def test_a_load_held_from_the_start_is_never_ok_with_a_wrong_number(name: str, mass: float) -> None:
+    for seed in (0, 1):
+        payload = session(name, mass=mass, loads=((0.0, mass),), duration=3.0, seed=seed).touch.payload
+        ok = payload.status == int(pp.Status.ok)
+        error = np.abs(payload.mass - mass)[ok] / payload.mass_std[ok]
+        assert np.count_nonzero(ok) > 300
+        assert np.max(error) < 5.0
+        assert np.mean(error < W.weighing.TWO_SIDED_95) > 0.9
+        assert payload.changes[-1] == 0
+
+
 @pytest.mark.parametrize("pose", ["Take", "Take3", "goal"])
 def test_what_the_arm_cannot_lift_is_not_ok(pose: str) -> None:
     result = W.weigh_session(session(mass=5.0, pose=pose, duration=8.0))

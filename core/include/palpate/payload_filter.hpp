@@ -31,6 +31,9 @@ struct PayloadFilterConfig {
 ///
 /// The torque is linear in m and m delta but for m |delta|^2. (In m and delta it is not: a load that hangs still says
 /// m delta = 0, from which a filter on delta would conclude that m is small.)
+/// What bounds the first moment is |delta|, not the mass that the arm could hold: its prior follows what is known of the mass,
+/// standard deviation offset_prior_std (|m| + 2 std(m)). With first_moment the load's own inertia, which is not in the state, is
+/// taken to be up to that of a radius of gyration of 2 offset_prior_std.
 /// b is a first-order process of standard deviation Friction::uncertainty (wide at rest, where stiction hides any torque
 /// within +-F_c) and time friction_time; a start, a stop and a reversal draw it anew.
 ///
@@ -38,7 +41,11 @@ struct PayloadFilterConfig {
 /// propagates the error e that a unit jump would leave and correlates it with the innovations y of variance S:
 ///   jump = sum(e y/S) / I,   significance = |sum(e y/S)| / sqrt(I)  [standard deviations],   I = sum(e^2/S) + 1/mass_prior_std^2.
 /// The prior keeps a joint that hardly feels the load from explaining its own breakaway by a load that no arm could hold.
-/// The winner's e, times the prior, is added to the covariance, so that the new load is learnt as the first one was.
+/// The winner's e, times the prior, is added to the covariance, so that the new load is learnt as the first one was. Until the
+/// mass has been known for a while it corrects the first guess and is not counted as a change.
+///
+/// The interval that is reported counts, beside the filter's, how far the estimate has moved of late: one that linearisation
+/// still drags along is not known as well as its variance says.
 class PayloadFilter {
  public:
   static constexpr int max_parameters = 4 + 2 * max_joints;
@@ -109,8 +116,12 @@ class PayloadFilter {
       forget_load();
       restart_hypotheses();
     }
+    bound_first_moment();
     look_for_change(s);
-    return report(s, Status::ok);
+    mass_before_ -= std::expm1(-s.dt / lag) * (filter_.parameter(0) - mass_before_);
+    const Payload out = report(s, Status::ok);
+    if (known_time_ < known_after) known_time_ = out.status == Status::ok ? known_time_ + s.dt : 0.0;
+    return out;
   }
 
   void reset() { *this = PayloadFilter(*arm_, config_); }
@@ -164,6 +175,7 @@ class PayloadFilter {
   void forget_everything() noexcept {
     surprise_.fill(1.0);
     unexplained_variance_ = unexplained_time_ = 0.0;
+    mass_before_ = known_time_ = 0.0;
     mass_prior_std_ = initial_prior_std_;
     model_error_.fill(least_model_error);
     filter_.set_parameter(0, 0.0, mass_prior_std_ * mass_prior_std_);
@@ -171,10 +183,34 @@ class PayloadFilter {
   }
   void set_offset_prior() noexcept {
     const double moment = config_.offset_prior_std * mass_prior_std_;
+    bounding_mass_ = mass_prior_std_;
     for (int k = 1; k < loads_; ++k) filter_.set_parameter(k, 0.0, moment * moment);
+  }
+  /// Makes the prior of m delta that of the mass as it is known now: the difference of information is a measurement of zero,
+  /// a difference the other way is more variance.
+  void bound_first_moment() noexcept {
+    if (loads_ == 1) return;
+    const double mass = std::max(std::abs(filter_.parameter(0)) + 2.0 * mass_std(), config_.ok_absolute);
+    if (mass > 0.8 * bounding_mass_ && mass < 1.2 * bounding_mass_) return;
+    const double before = config_.offset_prior_std * bounding_mass_, now = config_.offset_prior_std * mass;
+    const double information = 1.0 / (now * now) - 1.0 / (before * before);
+    for (int k = 1; k < loads_; ++k) {
+      if (information <= 0.0) {
+        filter_.add_parameter_variance(k, now * now - before * before);
+        continue;
+      }
+      const int moment = 2 * arm_->n() + k;
+      const Filter::Update update = filter_.measure(moment, -1, 0.0, 1.0 / information);
+      for (Hypothesis& hyp : hypotheses_) {  // no evidence for or against a jump
+        const double seen = hyp.e[u(moment)];
+        for (int r = 0; r < filter_.dim(); ++r) hyp.e[u(r)] -= update.K[r] * seen;
+      }
+    }
+    bounding_mass_ = mass;
   }
   /// The mass may be another one.
   void forget_load() noexcept {
+    known_time_ = 0.0;
     filter_.set_parameter(0, filter_.parameter(0), mass_prior_std_ * mass_prior_std_);
     set_offset_prior();
   }
@@ -183,6 +219,12 @@ class PayloadFilter {
     Inertia<double> load{};
     for (int k = 0; k < loads_; ++k) load = load + filter_.parameter(k) * unit_[u(k)];
     return load;
+  }
+  /// The load as the filter moves it. A little less than nothing, by noise, is a body like any other: what the arm does is
+  /// then smooth in the mass, and the estimate of an empty hand unbiased. More, by a wrong model, is weight without inertia.
+  Inertia<double> moving(const Inertia<double>& load) const noexcept {
+    const bool little = -load.m * most_share_ < 0.3;
+    return load.m < 0.0 && little ? -1.0 * physical(-1.0 * load) : physical(load);
   }
   /// A body that can be: c no further from the grasp point than a hand could hold it.
   Inertia<double> physical(const Inertia<double>& load) const noexcept {
@@ -207,9 +249,8 @@ class PayloadFilter {
     }
     JointVector variance = torque_variance_;
     for (int i = 0; i < arm_->n(); ++i) variance[u(i)] += model_error_[u(i)];
-    add_curvature(variance);
-    const Inertia<double> state = load_of_state(), real = physical(state);
-    // A negative mass has weight in the filter, so that its estimate stays unbiased near zero, but no inertia.
+    add_neglected(variance, h);
+    const Inertia<double> state = load_of_state(), real = moving(state);
     const Inertia<double> rest{state.m - real.m, state.mc - real.mc, Sym3<double>{}};
     const int last = arm_->n() - 1;
     filter_.predict(*arm_, {s.tau, variance, real, rest, decay_}, h, [&](const BaseFrame& chain, double* D, int stride) {
@@ -248,20 +289,26 @@ class PayloadFilter {
     return std::max(1.0, sum / arm_->n());
   }
 
-  /// What linearisation in the mass leaves out, as extra torque variance [N^2 m^2]; both vanish as the mass becomes known.
+  /// What linearisation in the mass and the state leave out, as extra torque variance [N^2 m^2].
   /// Lever: weight torque is m times a lever that moves with q, so var(m) sum_j (d lever_i / dq_j)^2 var(z_j). Without it a
   /// filter that starts hanging, where the lever is zero, believes in masses it has read from its own noise.
   /// Inertia: q'' is not linear in m where the load may outweigh the links, so (std(m) J_i.(a_c - g))^2 times
   /// (std(m) J_i.J_i / W_ii)^2, at most 1. Without it the first samples of a light arm are taken for a weighing.
-  void add_curvature(JointVector& variance) noexcept {
+  /// Rotation: the load's own inertia, m r^2 at most, times the angular acceleration about the joint.
+  /// The latter two are no noise but last for a time `lag`: noise drawn anew every h leaves as much doubt over it if its variance
+  /// is lag/h times theirs. The first two vanish as the mass becomes known.
+  void add_neglected(JointVector& variance, double h) noexcept {
     const Pose<double> P = forward_kinematics<double>(*arm_, filter_.positions());
     const Vec3<double> c = P.p + P.R * arm_->p_last_grasp(), g = arm_->gravity();
     const double mass_variance = filter_.parameter_variance(0);
     std::array<Vec3<double>, max_joints> J;
-    Vec3<double> a_c{};
+    const double samples = std::max(1.0, lag / h), radius = loads_ > 1 ? 2.0 * config_.offset_prior_std : 0.0;
+    const double own_inertia = std::abs(filter_.parameter(0)) * radius * radius;
+    Vec3<double> a_c{}, spin{};
     for (int j = 0; j < arm_->n(); ++j) {
       J[u(j)] = jacobian_column(*arm_, P, j, c);
       a_c = a_c + filter_.acceleration()[u(j)] * J[u(j)];
+      if (!arm_->body(j).prismatic) spin = spin + filter_.acceleration()[u(j)] * P.axis[u(j)];
       for (int i = 0; i <= j; ++i) {
         if (arm_->body(i).prismatic) continue;
         const double slope = dot(cross(P.axis[u(i)], J[u(j)]), g);
@@ -269,10 +316,14 @@ class PayloadFilter {
         if (i != j) variance[u(j)] += mass_variance * slope * slope * arm_->position_variance(i);
       }
     }
+    most_share_ = 0.0;
     double information = 0.0;  // about the mass, were the learnt model error a constant torque [1/kg^2]
     for (int i = 0; i < arm_->n(); ++i) {
       const double torque = dot(J[u(i)], a_c - g), share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
-      variance[u(i)] += mass_variance * torque * torque * std::min(1.0, mass_variance * share * share);
+      most_share_ = std::max(most_share_, share);
+      variance[u(i)] += samples * mass_variance * torque * torque * std::min(1.0, mass_variance * share * share);
+      const double turning = arm_->body(i).prismatic ? 0.0 : own_inertia * dot(P.axis[u(i)], spin);
+      variance[u(i)] += samples * turning * turning;
       information += torque * torque / std::max(model_error_[u(i)] - least_model_error, 1e-12);
     }
     unexplained_variance_ = 1.0 / std::max(information, 1e-12);
@@ -312,7 +363,7 @@ class PayloadFilter {
       // A small one soon after a change is what the first guess of its size and instant left over: corrected, not counted.
       const bool correction = changes_ > 0 && s.time_ns - change_seen_ns_ < 1'000'000'000 && std::abs(jump) < 0.5 * last_jump_;
       const double prior = correction ? 2.0 * std::abs(jump) : mass_prior_std_;
-      if (!correction) {
+      if (!correction && known_time_ >= known_after) {
         ++changes_;
         change_time_ns_ = best->since;
         change_seen_ns_ = s.time_ns;
@@ -327,6 +378,7 @@ class PayloadFilter {
       }
       filter_.add_direction(best->e, jump, prior * prior);
       if (!correction) set_offset_prior();
+      mass_before_ = filter_.parameter(0);
       restart_hypotheses();
       return;
     }
@@ -339,7 +391,7 @@ class PayloadFilter {
   Payload report(const JointSample&, Status status) const noexcept {
     Payload out;
     out.mass = filter_.parameter(0);
-    out.mass_std = std::hypot(mass_std(), std::sqrt(unexplained_variance_));
+    out.mass_std = std::hypot(mass_std(), std::sqrt(unexplained_variance_), out.mass - mass_before_);
     for (int k = 1; k < loads_; ++k) {
       out.first_moment[u(k - 1)] = filter_.parameter(k);
       out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0));
@@ -348,7 +400,8 @@ class PayloadFilter {
     out.change_time_ns = change_time_ns_;
     out.status = status;
     const bool sure = out.mass_std <= std::max(config_.ok_relative * std::abs(out.mass), config_.ok_absolute);
-    if (status == Status::ok && !(sure && explained())) out.status = Status::warming;
+    const bool possible = out.mass >= -std::max(3.0 * out.mass_std, config_.ok_absolute);
+    if (status == Status::ok && !(sure && possible && explained())) out.status = Status::warming;
     return out;
   }
 
@@ -362,6 +415,8 @@ class PayloadFilter {
   JointVector tau_{}, torque_variance_{}, surprise_{}, model_error_{};
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
+  static constexpr double lag = 0.1;          // errors of linearisation last about so long [s]
+  static constexpr double known_after = 0.3;  // [s]
   detail::Regime regime_{presliding};
   std::array<Hypothesis, 12> hypotheses_;
   bool started_ = false;
@@ -370,6 +425,10 @@ class PayloadFilter {
   double last_jump_ = 0.0;  // [kg]
   double unexplained_variance_ = 0.0;  // of the mass, by what the model gets wrong [kg^2]
   double unexplained_time_ = 0.0;      // [s]
+  double mass_before_ = 0.0;           // the estimate about `lag` ago [kg]
+  double known_time_ = 0.0;            // `ok` without a break since the load was forgotten, up to known_after [s]
+  double bounding_mass_ = 0.0;         // whose first moment's prior holds [kg]
+  double most_share_ = 0.0;            // of a joint's inertia, per mass at the grasp point [1/kg]
 };
 
 }  // namespace palpate
