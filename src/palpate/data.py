@@ -3,7 +3,7 @@
 palpate carries no recording, because they are not ours to pass on. :func:`find` serves a file from the first of
 
 1. the folder that the environment variable ``PALPATE_DATA`` names,
-2. where it names none, ``../shared/data`` beside the checkout, when the program or palpate itself is run from a checkout,
+2. where it names none, ``../shared/data`` beside the checkout, when the program or palpate is run from one,
 3. the user's cache, which :func:`get` fills from the original repository (needs ``palpate[data]``),
 
 each laid out as one folder per data set. Every file is checked against its SHA-256 before it is used.
