@@ -2,8 +2,8 @@
 
 Needs palpate[sim]. Prints:
 
-    1 s  warming  0.209 ± 0.042 kg
-    2 s  ok       0.247 ± 0.002 kg
+    1 s  warming  0.235 ± 0.046 kg
+    2 s  ok       0.249 ± 0.003 kg
     3 s  ok       0.250 ± 0.001 kg
     4 s  ok       0.250 ± 0.000 kg
     5 s  ok       0.250 ± 0.000 kg

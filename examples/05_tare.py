@@ -2,7 +2,7 @@
 
 Needs palpate[sim]. Prints:
 
-    as modelled: 0.230 ± 0.002 kg
+    as modelled: 0.228 ± 0.009 kg
     tared: 0.250 ± 0.000 kg
 """
 
