@@ -112,7 +112,7 @@ def real_rows(folder: Path, arm: Arm, detector: ContactDetector) -> list[Row]:
     near = [min(hits, key=lambda h, t=t: abs(h[0] - t), default=None) for t in truth]  # type: ignore[misc]
     met = [h for t, h in zip(truth, near, strict=True) if h is not None and abs(h[0] - t) <= 2.0 * ONSET]
     away = [abs(h[0] - t) for t, h in zip(truth, near, strict=True) if h in met and h is not None]
-    extra = [t for t, e in hits if all(e is not h[1] for h in met)]
+    extra = [h for h in hits if all(h[1] is not m[1] for m in met)]
     second = sum(e.link == 1 for _, e in met)
     allowed = sum(e.link <= 1 <= e.farthest for _, e in met)
     rows = [
@@ -121,7 +121,8 @@ def real_rows(folder: Path, arm: Arm, detector: ContactDetector) -> list[Row]:
             "UR10e, hits on link 2: link 2 named",
             len(truth),
             second,
-            f"{allowed} say link 2 or beyond is possible; pushed along the axis of joint 2, only joint 1 feels it",
+            f"of {len(met)} found; {allowed} say link 2 or beyond is possible; pushed along the axis of joint 2, only "
+            "joint 1 feels it",
         ),
         at_most("UR10e, hits: onset off the label, worst", ONSET, max(away, default=math.inf), "s"),
         at_most(
@@ -129,7 +130,7 @@ def real_rows(folder: Path, arm: Arm, detector: ContactDetector) -> list[Row]:
             0,
             len(extra),
             "",
-            f"at {', '.join(f'{t:.2f} s' for t in extra)}" if extra else "",
+            _where(extra),
         ),
     ]
     pushes = events(arm, detector, open_recording(folder, PUSHES))
@@ -150,11 +151,21 @@ def real_rows(folder: Path, arm: Arm, detector: ContactDetector) -> list[Row]:
     )
     for name in (*FREE, *UNSEEN):
         log = open_recording(folder, name)
-        count = len(events(arm, detector, log))
+        found = events(arm, detector, log)
+        note = f"{log.duration:.0f} s" + (f"; {_where(found)}" if found else "")
         rows.append(
-            at_most(f"UR10e, free: contacts in {Path(name).stem}", 0, count, "", f"{log.duration:.0f} s")
+            at_most(f"UR10e, free: contacts in {Path(name).name.split('.')[0]}", 0, len(found), "", note)
         )
     return rows
+
+
+def _where(found: Sequence[tuple[float, ContactEvent]]) -> str:
+    """When contacts began, and what the joint felt that felt most."""
+    parts = []
+    for t, e in found:
+        j = int(np.argmax(np.abs(e.torque / e.std)))
+        parts.append(f"{t:.2f} s: {e.torque[j]:+.3g} ± {1.96 * e.std[j]:.2g} N m on joint {j + 1}")
+    return "; ".join(parts)
 
 
 def _all(what: str, required: int, ours: int, note: str = "") -> Row:
