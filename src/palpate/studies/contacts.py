@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import math
 import os
@@ -482,13 +483,14 @@ def jobs_of(plants: Sequence[Plant], hours: float, trials: int) -> Iterator[Job]
 
 
 def made_by(plants: Sequence[Plant]) -> str:
-    """What results depend on: the arms, the detectors, the compiled core and this module."""
+    """What results depend on: the arms, the detectors, the compiled core and the simulation."""
     digest = hashlib.sha256()
     for plant in plants:
         digest.update(plant.arm.to_header().encode())
         digest.update(repr((plant.name, *(getattr(plant, k) for k in Plant.__slots__[2:]))).encode())
-    for file in (_core.__file__, __file__):
-        digest.update(Path(str(file)).read_bytes())
+    digest.update(Path(str(_core.__file__)).read_bytes())
+    for part in (motion, wander, simulate, shortest, measure):
+        digest.update(inspect.getsource(part).encode())
     return digest.hexdigest()
 
 
