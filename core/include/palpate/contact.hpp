@@ -266,7 +266,8 @@ class ContactDetector {
     J.fast_variance = a / (2.0 - a) * white + (momentum ? 2.0 * square(a / h) / (2.0 - a) * R : 0.0);
     J.z = z;
     const double most = config_.clip * std::sqrt(white + (momentum ? 2.0 * R / (h * h) : 0.0));
-    J.steady += (elapsed_ > h ? a : 1.0) * std::clamp(now - J.center - J.steady, -most, most);
+    const double moved = now - J.center - J.steady;
+    J.steady += elapsed_ < config_.warm_up ? (elapsed_ > h ? a : 1.0) * moved : a * std::clamp(moved, -most, most);
     J.beyond = J.rest > 0.5 ? std::max(0.0, std::abs(J.steady) - std::sqrt(3.0 * V_rest)) / std::sqrt(J.fast_variance + V - V_rest) : 0.0;
     if (J.beyond < 3.0) J.held = false;
     if (J.beyond < 1.0) J.armed = elapsed_ >= config_.warm_up, J.within_ns = last_ns_;
