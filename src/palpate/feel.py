@@ -267,8 +267,8 @@ def feel_log(
             count = int(found.count[-1])
             said_of = "a contact was" if count == 1 else f"{count} contacts were"
             remarks.append(
-                f"In {record.duration:.0f} s of free motion {said_of} found where there is none: the model's errors are at "
-                "times larger than their measure, and so they may be here."
+                f"In {record.duration:.0f} s of free motion {said_of} found where there is none: the model's errors "
+                "are at times larger than their measure, and so they may be here."
             )
     pipeline.reset()
     touch = pipeline.run(log)
