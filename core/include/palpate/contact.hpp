@@ -51,7 +51,7 @@ struct ContactConfig {
 /// While a joint rests the filter follows whatever stiction may do, and with the noise it would follow a slow push beyond it
 /// too. So there what acts, low-passed with contact_time, is also held against stiction itself: alarm at
 ///   (|b - center| - F)/std > x,   P(N(0, 1) > x) = 1/ARL,   std of the low-passed noise and the slow errors,
-/// once it has been within (what is there at a start, or stays after a contact, is a load); that contact lasts while it is > 3.
+/// of a joint that rests for nine parts in ten (rho > 0.9), once it has been within (what is there at a start, or stays after a contact, is a load); that contact lasts while it is > 3.
 ///
 /// The onset is when the alarmed sum last left zero. From then on b of an alarmed joint is kept and what the joint feels beyond
 /// it is the contact's torque c, until it has been within three standard deviations, or stiction, for release_time.
@@ -268,7 +268,7 @@ class ContactDetector {
     const double most = config_.clip * std::sqrt(white + (momentum ? 2.0 * R / (h * h) : 0.0));
     const double moved = now - J.center - J.steady;
     J.steady += elapsed_ < config_.warm_up ? (elapsed_ > h ? a : 1.0) * moved : a * std::clamp(moved, -most, most);
-    J.beyond = J.rest > 0.5 ? std::max(0.0, std::abs(J.steady) - std::sqrt(3.0 * V_rest)) / std::sqrt(J.fast_variance + V - V_rest) : 0.0;
+    J.beyond = J.rest > 0.9 ? std::max(0.0, std::abs(J.steady) - std::sqrt(3.0 * V_rest)) / std::sqrt(J.fast_variance + V - V_rest) : 0.0;
     if (J.beyond < 3.0) J.held = false;
     if (J.beyond < 1.0) J.armed = elapsed_ >= config_.warm_up, J.within_ns = last_ns_;
 
