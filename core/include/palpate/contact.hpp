@@ -51,7 +51,8 @@ struct ContactConfig {
 /// While a joint rests the filter follows whatever stiction may do, and with the noise it would follow a slow push beyond it
 /// too. So there what acts, low-passed with contact_time, is also held against stiction itself: alarm at
 ///   (|b - center| - F)/std > x,   P(N(0, 1) > x) = 1/ARL,   std of the low-passed noise and the slow errors,
-/// of a joint that rests for nine parts in ten (rho > 0.9), once it has been within (what is there at a start, or stays after a contact, is a load); that contact lasts while it is > 3.
+/// of a joint that surely rests (rho > 0.9), once it has been within (what is there at a start, or stays after a contact, is a
+/// load); that contact lasts while it is > 3.
 ///
 /// The onset is when the alarmed sum last left zero. From then on b of an alarmed joint is kept and what the joint feels beyond
 /// it is the contact's torque c, until it has been within three standard deviations, or stiction, for release_time.
