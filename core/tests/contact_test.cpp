@@ -253,6 +253,43 @@ TEST(Contact, BreakingAwayFromRestIsNone) {  // the drive loads its gear up to t
   EXPECT_EQ(seen.count, 0u);
 }
 
+TEST(Contact, ASlowPushAtRestIsFoundOnceItOutdoesStiction) {
+  ArmDescription d = description(2);
+  for (int j : {0, 1}) d.joints[at(j)].velocity_std = 2e-3;  // noise of the velocity hides who turned the sign
+  const Arm arm(d);
+  const double F = 1.3 * 2.0, rise = 10.0;  // stiction that may be [N m], of the push [N m/s]
+  for (double loaded : {-2.0, 0.0, 2.0}) {
+    ContactDetector detector(arm);
+    const LoadTorque load(arm);
+    Random noise(7);
+    for (int k = 0; k < 3000; ++k) {
+      JointSample s;
+      s.time_ns = k * 1000000ll;
+      s.dt = k > 0 ? 1e-3 : 0.0;
+      s.velocity_measured = true;
+      s.status = Status::ok;
+      const double push = rise * std::max(0.0, 1e-3 * (k - 1000));
+      const auto m = momentum_terms<double>(arm, s.q, JointVector{});
+      for (int j = 0; j < 2; ++j) {
+        s.dq_std[at(j)] = 2e-3;
+        s.dq[at(j)] = 2e-3 * noise.normal();
+        s.tau[at(j)] = m.g[at(j)] + loaded - (j == 0 ? push : 0.0) + 0.1 * noise.normal();
+      }
+      const Contact seen = detector.step(s, load);
+      const double borne = std::abs(loaded - push);
+      if (borne <= F) {
+        ASSERT_EQ(seen.count, 0u) << loaded << ", " << k;
+      } else if (borne > 2.5 * F) {
+        ASSERT_TRUE(seen.active) << loaded << ", " << k;
+      }
+      if (seen.count > 0) {
+        EXPECT_EQ(seen.count, 1u) << "one push, one contact";
+        EXPECT_EQ(seen.link, 0);
+      }
+    }
+  }
+}
+
 TEST(Contact, ALoadThatIsKnownIsNone) {
   ArmDescription d = description(4);
   const Arm arm(d);

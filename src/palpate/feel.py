@@ -159,7 +159,7 @@ def _settings(feeling: Feeling) -> dict[str, object]:
     found: dict[str, object] = {"palpate": __version__}
     for part in ("observer", "wrench", "contact", "load", "conditioner"):
         for key, value in (feeling.pipeline.get(part) or {}).items():
-            if value is not None:
+            if value is not None and value != []:
                 found[part if key == "name" else f"{part} {key}"] = value
     return found
 
@@ -174,7 +174,7 @@ def rate_words(feeling: Feeling) -> str:
 def push_words(push: Push, arm: Arm) -> dict[str, str]:
     """A contact in words: time, link, force, torque."""
     late = 1e3 * (push.alarm - push.start)
-    until = "the end" if math.isnan(push.stop) else f"{push.stop:.3f} s"
+    until = "the end" if math.isnan(push.stop) else f"{push.stop:.3f}\N{NO-BREAK SPACE}s"
     where = push.link if push.link == push.farthest else f"{push.link} (or beyond, up to {push.farthest})"
     parts = []
     for axis, value, std, unseen in zip("xyz", push.force, push.force_std, push.singular, strict=True):
@@ -184,9 +184,9 @@ def push_words(push: Push, arm: Arm) -> dict[str, str]:
         f"{arm.joint_names[j]} {push.event.torque[j]:+.2g} ± {1.96 * push.event.std[j]:.2g}" for j in felt
     ]
     return {
-        "from": f"{push.start:.3f} s",
+        "from": f"{push.start:.3f}\N{NO-BREAK SPACE}s",
         "to": until,
-        "declared after": f"{late:.0f} ms",
+        "declared after": f"{late:.0f}\N{NO-BREAK SPACE}ms",
         "link": where + (", the tip would explain it" if push.tip else ""),
         "force": ", ".join(parts) + " N",
         "torque": (", ".join(torques) + " N m") if torques else "within three standard deviations",
@@ -264,9 +264,11 @@ def feel_log(
         found = pipeline.run(record).contact
         assert found is not None
         if found.count[-1]:
+            count = int(found.count[-1])
+            said_of = "a contact was" if count == 1 else f"{count} contacts were"
             remarks.append(
-                f"In {record.duration:.0f} s of free motion {int(found.count[-1])} contacts were found where there are "
-                "none: the model's errors are at times larger than their measure, and so they may be here."
+                f"In {record.duration:.0f} s of free motion {said_of} found where there is none: the model's errors "
+                "are at times larger than their measure, and so they may be here."
             )
     pipeline.reset()
     touch = pipeline.run(log)

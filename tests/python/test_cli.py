@@ -475,7 +475,7 @@ def test_doctor_tells_what_is_missing(palpate, monkeypatch: pytest.MonkeyPatch) 
 def fake_studies(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two studies that take no time: one holds, one misses."""
 
-    def run(self: Study, progress=None, quick: bool = False) -> StudyResult:
+    def run(self: Study, progress=None, quick: bool = False, folder=None, hours=None) -> StudyResult:
         if progress is not None:
             progress(1, 2, float("inf"))
             progress(2, 2, 0.0)
@@ -487,7 +487,7 @@ def fake_studies(monkeypatch: pytest.MonkeyPatch) -> None:
         return StudyResult(self.name, self.title, rows, {}, ("measured here",), 0.1)
 
     monkeypatch.setattr(Study, "run", run)
-    fakes = {n: Study(n, f"It {n}", "bench") for n in ("holds", "misses")}
+    fakes = {n: Study(n, f"It {n}", "bench", campaign=n == "holds") for n in ("holds", "misses")}
     monkeypatch.setattr(studies, "STUDIES", {**fakes, "paper": Study("paper", "A paper", "reproduce")})
 
 
@@ -513,6 +513,14 @@ def test_studies_print_write_and_judge(palpate, tmp_path: Path, fake_studies: No
     assert palpate("reproduce", "--list", "--json").json == {
         "studies": [{"name": "paper", "title": "A paper"}]
     }
+
+
+def test_hours_are_for_campaigns(palpate, fake_studies: None) -> None:
+    assert palpate("bench", "holds", "--hours", "2").code == 0
+    done = palpate("bench", "--hours", "2")
+    assert done.code == 2 and "misses runs for a fixed time; a campaign is: holds" in done.err
+    assert "a number > 0" in palpate("bench", "holds", "--hours", "0").err
+    assert "give one of them" in palpate("bench", "holds", "--hours", "2", "--quick").err
 
 
 def test_the_real_studies_are_known(palpate) -> None:

@@ -12,6 +12,7 @@ import palpate as pp
 from palpate.cli import main
 from palpate.feel import Feeling, feel_log
 from palpate.report import write_feel_report
+from palpate.weigh.noise import describe_noise
 from test_touch import FORCE, PUSH, arm, swing
 
 __all__ = ["arm"]  # the fixture
@@ -174,3 +175,24 @@ def test_the_command_refuses(files, tmp_path, capsys):
     (tmp_path / "report.html").write_text("mine")
     assert feel(files, "-o", tmp_path) == 2
     assert "not written by palpate" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["sampled when stamped", "sampled evenly, stamped late"])
+def test_uneven_stamps_are_no_noise_of_the_position(late: bool) -> None:
+    rng = np.random.default_rng(3)
+    arm = pp.robots.load("kuka_lbr_iiwa14")
+    arm = arm.replace(joints=tuple(j.replace(sensing=pp.Sensing()) for j in arm.joints))
+    even = np.arange(3000) * 0.01
+    stamps = even + rng.uniform(0.0, 0.004, len(even))
+    moved = np.sin((even if late else stamps)[:, None] + np.arange(7))
+    log = pp.Log(
+        time_ns=np.rint(stamps * 1e9).astype(np.int64),
+        position=moved + 2e-5 * rng.normal(size=moved.shape),
+        effort=0.3 * rng.normal(size=moved.shape),
+        joint_names=arm.joint_names,
+    )
+    found, said = describe_noise(arm, log)
+    assert "taken from the log itself" in said
+    for joint in found.joints:
+        assert joint.sensing.position_std == pytest.approx(2e-5, rel=0.15)  # without the largest
+        assert joint.sensing.torque_std == pytest.approx(0.3, rel=0.15)

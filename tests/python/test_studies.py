@@ -33,6 +33,7 @@ from palpate.studies import (
     wrong_masses,
 )
 from palpate.studies._bench import MASS, POSES, FeedbackLaw, PublishedLaw, Work, settled
+from palpate.studies._kept import Kept
 
 
 @pytest.fixture(scope="module")
@@ -522,5 +523,81 @@ def test_the_contact_campaign_is_what_it_is_said_to_be():
     assert np.allclose(slow.std(axis=0), 0.5, rtol=0.25)
     step = slow[1000:] * slow[:-1000]  # one correlation time later
     assert np.allclose(step.mean(axis=0) / slow.var(axis=0), np.exp(-1.0), atol=0.2)
-    log, touched = contacts.simulate(contacts.Job(plant, 4.0, 3, contacts.SOFT, 150.0))
-    assert 2.0 <= touched <= 2.8 and len(log) == 4000
+    log, push = contacts.simulate(contacts.Job(plant, 4.0, 3, contacts.SOFT, 150.0))
+    assert push is not None and 2.0 <= push.time <= 2.8 and len(log) == 4000
+    assert contacts.simulate(contacts.Job(plant, 4.0, 3))[1] is None
+
+
+def test_the_best_possible_test_is_the_matched_filter():
+    """Against its closed form for a ramp in white noise; stiction hides what it can; nothing felt, nothing found."""
+    plant = dataclasses.replace(contacts.iiwa(), model_std=(1e-9,) * 7)
+    time = (np.arange(4000)[:, None] + 0.5) / contacts.RATE
+    ramp = time * ([50.0] + [0.0] * 6)  # N m on one joint of 0.1 N m noise
+    none = np.zeros_like(ramp)
+    found = contacts.shortest(plant, contacts.Push(0.0, ramp, none, none))
+    # d^2 = r^2 T^3/(3 R h) meets the point of probability 1e-3/3600 T, 6.3 standard deviations
+    assert found == pytest.approx((3.0 * 6.3**2 * 0.01 * 1e-3) ** (1 / 3) / 50.0 ** (2 / 3), rel=0.1)
+    both = np.repeat(ramp[:, :1], 2, axis=1)
+    assert contacts.shortest(plant, contacts.Push(0.0, np.hstack([both, none[:, 2:]]), none, none)) < found
+    still = contacts.shortest(plant, contacts.Push(0.0, ramp, none, np.full_like(ramp, 5.0)))
+    assert still == pytest.approx(0.1 + found, abs=0.002)  # 5 N m of stiction at 50 N m/s
+    helped = contacts.shortest(plant, contacts.Push(0.0, ramp, none - 3.0, np.full_like(ramp, 5.0)))
+    assert helped == pytest.approx(0.04 + found, abs=0.002)
+    assert contacts.shortest(plant, contacts.Push(0.0, none, none, none)) == math.inf
+
+
+def test_no_contact_is_found_sooner_than_possible():
+    plant = contacts.iiwa()
+    for k in range(5):
+        found = contacts.measure(contacts.Job(plant, 4.0, k, contacts.SOFT, 150.0))
+        assert 0.0 < found.bound <= found.delay
+
+
+def test_fewer_hours_than_asked_for_prove_nothing():
+    quiet = [contacts.Found(0)] * 3
+    assert contacts.campaign_rows("arm", quiet, contacts.HOURS)[0].ok is True
+    assert contacts.campaign_rows("arm", [contacts.Found(1)] * 2, contacts.HOURS)[0].ok is False
+    (few,) = contacts.campaign_rows("arm", quiet, 10.0)
+    assert few.ok is False and "10 h" in few.what and "100 h are asked for" in few.note
+
+
+def test_kept_results_outlive_the_process_that_made_them(tmp_path):
+    path = tmp_path / "state.jsonl"
+    kept = Kept(path, "this arm")
+    kept.put("a", {"delay": math.inf, "count": 1})
+    kept.put("b", 2)
+    with path.open("a") as file:
+        file.write('{"name": "c", "resu')  # killed while writing
+    again = Kept(path, "this arm")
+    assert (
+        again.get("a") == {"delay": math.inf, "count": 1} and again.get("b") == 2 and again.get("c") is None
+    )
+    again.put("c", 3)
+    assert Kept(path, "this arm").get("c") == 3
+    other = Kept(path, "another arm")
+    assert other.discarded == 3 and other.get("a") is None
+    assert Kept(path, "this arm").discarded == 0  # begun anew, and empty
+    path.write_text("time,q1\n0,1\n")
+    with pytest.raises(PalpateError, match="expected the kept results"):
+        Kept(path, "this arm")
+    Kept(None, "nothing is written").put("a", 1)
+
+
+def test_a_campaign_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    monkeypatch.delenv(contacts.VARIABLE, raising=False)
+    monkeypatch.setattr(contacts, "TRIALS", 2)
+    monkeypatch.setattr(contacts, "CHUNK", 2.0)
+    monkeypatch.setattr(_bench.os, "cpu_count", lambda: 1)
+    totals = []
+
+    def run(hours):
+        totals.clear()
+        return contacts.run(lambda done, total, left: totals.append(total), False, tmp_path, hours)[0]
+
+    first = run(4.0 / 3600.0)
+    assert totals[0] == 2 + 4
+    more = run(8.0 / 3600.0)
+    assert totals[0] == 2 and first[1:] == more[1:]
+    assert run(8.0 / 3600.0) == more and totals[0] == 0
+    with pytest.raises(PalpateError, match="no campaign"):
+        STUDIES["speed"].run(hours=1.0)

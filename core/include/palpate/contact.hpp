@@ -2,6 +2,7 @@
 #pragma once
 #include <algorithm>
 #include <limits>
+#include <numbers>
 
 #include "palpate/wrench.hpp"
 
@@ -43,9 +44,15 @@ struct ContactConfig {
 /// white with variance 1 as long as nothing touches the arm. Then for kappa = 1/4, 1/2, 1, 2, from soft contacts to hard ones,
 ///   g+ <- max(0, g+ + e - kappa),  g- <- max(0, g- - e - kappa),  alarm at g > h(kappa).
 /// The thresholds follow from the rate by Siegmund's approximation of the mean time between false alarms of one sum,
-///   ARL = (exp(x) - x - 1)/(2 kappa^2) samples,  x = 2 kappa (h + 1.166),   ARL = 8 n 3600/(rate dt),
-/// n joints with eight sums each, which share the rate; contact_test.cpp counts alarms. With model_residual,
-/// z = tau_model + tau_f - tau = b + w. Where friction remembers (FrictionHistory), stiction lies around what it remembers.
+///   ARL = (exp(x) - x - 1)/(2 kappa^2) samples,  x = 2 kappa (h + 1.166),   ARL = 10 n 3600/(rate dt),
+/// n joints with eight sums each, and two for the test that follows, which share the rate; contact_test.cpp counts alarms.
+/// With model_residual, z = tau_model + tau_f - tau = b + w. Where friction remembers (FrictionHistory), stiction lies around
+/// what it remembers, +-F.
+/// While a joint rests the filter follows whatever stiction may do, and with the noise it would follow a slow push beyond it
+/// too. So there what acts, low-passed with contact_time, is also held against stiction itself: alarm at
+///   (|b - center| - F)/std > x,   P(N(0, 1) > x) = 1/ARL,   std of the low-passed noise and the slow errors,
+/// of a joint that surely rests (rho > 0.9), once it has been within (what is there at a start, or stays after a contact, is a
+/// load); that contact lasts while it is > 3.
 ///
 /// The onset is when the alarmed sum last left zero. From then on b of an alarmed joint is kept and what the joint feels beyond
 /// it is the contact's torque c, until it has been within three standard deviations, or stiction, for release_time.
@@ -82,6 +89,16 @@ class ContactDetector {
     double x = 1.0;
     for (int k = 0; k < 60; ++k) x = std::log(1.0 + x + 2.0 * kappa * kappa * wanted);
     return std::max(x / (2.0 * kappa) - 1.166, 0.0);
+  }
+
+  /// x with P(N(0, 1) > x) = p, for 0 < p < 0.5.
+  static double upper_point(double p) noexcept {
+    double low = 0.0, high = 40.0;
+    for (int k = 0; k < 60; ++k) {
+      const double x = 0.5 * (low + high);
+      (0.5 * std::erfc(x / std::numbers::sqrt2) > p ? low : high) = x;
+    }
+    return high;
   }
 
   /// A sample, and the torque of the load that is held.
@@ -130,9 +147,12 @@ class ContactDetector {
     double wandered = 0.0, renewed = 0.0;        // variance of base: as known then and what wandered since; by turns of the sign
     double bound = 0.0, center = 0.0;            // sqrt(3 V); b at rest lies within center +- bound
     bool feels = false, unsure = true;           // unsure of the direction of motion
-    double rest = 0.0, dq = 0.0;                 // rho; q' of the last sample
+    double rest = 0.0, dq = 0.0, dry = 0.0;      // rho; q' of the last sample, and the dry friction it gives
     double felt = 0.0;                           // how long the joint has felt this contact [s]
     SignTravel travel{};
+    double steady = 0.0, beyond = 0.0;           // what acts off center, clipped and low-passed [N m]; how far beyond stiction at rest [std]
+    bool armed = false, held = false;            // it was within stiction; it alarmed by being beyond, and is still
+    std::int64_t within_ns = 0;                  // when it last was
 
     /// The part of b that the model's errors may be.
     double stiction(double x) const noexcept { return std::clamp(x, center - bound, center + bound); }
@@ -210,8 +230,9 @@ class ContactDetector {
     mean_dt_ = mean_dt_ > 0.0 ? mean_dt_ + 0.02 * (dt - mean_dt_) : dt;
     if (std::abs(mean_dt_ - threshold_dt_) <= 0.02 * threshold_dt_) return;
     threshold_dt_ = mean_dt_;
-    const double samples = static_cast<double>(2 * drifts.size()) * arm_->n() * 3600.0 / (config_.false_alarms_per_hour * mean_dt_);
+    const double samples = static_cast<double>(2 * drifts.size() + 2) * arm_->n() * 3600.0 / (config_.false_alarms_per_hour * mean_dt_);
     for (std::size_t k = 0; k < drifts.size(); ++k) h_[k] = threshold(drifts[k], samples);
+    most_beyond_ = upper_point(1.0 / samples);
   }
 
   void follow(int j, const JointSample& s, const LoadTorque& load, const Measurement& m) noexcept {
@@ -224,14 +245,18 @@ class ContactDetector {
     const bool undirected = unsure || J.unsure;  // beta is a mean over two samples
     J.unsure = unsure;
     J.dq = s.dq[u(j)];
-    J.rest = std::max(undirected ? 1.0 : 1.0 - square(std::tanh(s.dq[u(j)] / friction.sign_velocity)), J.rest * std::exp(-h / config_.settle_time));
+    // What friction was loaded with at rest wears off with time, and no sooner than over the travel in which it turns over.
+    const double kept = friction.presliding > 0.0 ? std::exp(-h * std::abs(s.dq[u(j)]) / friction.presliding) : 0.0;
+    J.rest = std::max(undirected ? 1.0 : 1.0 - square(std::tanh(s.dq[u(j)] / friction.sign_velocity)), J.rest * std::max(std::exp(-h / config_.settle_time), kept));
     const double V = model_variance(j, s, load, J.rest), V_rest = J.rest * rest_variance(j, s);
     const double back = -std::expm1(-h * (J.rest / config_.rest_time + (1.0 - J.rest) / config_.model_time));
     const double turned = J.travel.step(friction, s.dq[u(j)], s.dq_std[u(j)]) * rest_variance(j, s);
     const double slow = (V - V_rest) * -std::expm1(-2.0 * h / config_.model_time);
     const double quick = undirected ? 4.0 * V_rest : V_rest * -std::expm1(-2.0 * h / config_.rest_time);
     J.bound = (1.0 - J.rest) * std::sqrt(3.0 * V) + J.rest * (std::sqrt(3.0 * V_rest) + 2.0 * std::sqrt(V - V_rest));
-    J.center = J.rest * s.friction_excess[u(j)];
+    const double dry = friction.level(s.dq[u(j)]) * std::tanh(s.dq[u(j)] / friction.sign_velocity);
+    J.center = J.rest * (0.5 * (dry + J.dry) + s.friction_excess[u(j)]);  // the model's own, whatever noise of dq makes of either
+    J.dry = dry;
     const double white = white_variance(j) + 0.5 * square(m.slope[u(j)] * s.dq_std[u(j)]);
     const double input = m.input[u(j)] + 0.5 * (m.beta[u(j)] + beta_[u(j)]);
 
@@ -241,6 +266,12 @@ class ContactDetector {
     J.fast += (elapsed_ > h ? a : 1.0) * (now - J.fast);
     J.fast_variance = a / (2.0 - a) * white + (momentum ? 2.0 * square(a / h) / (2.0 - a) * R : 0.0);
     J.z = z;
+    const double most = config_.clip * std::sqrt(white + (momentum ? 2.0 * R / (h * h) : 0.0));
+    const double moved = now - J.center - J.steady;
+    J.steady += elapsed_ < config_.warm_up ? (elapsed_ > h ? a : 1.0) * moved : a * std::clamp(moved, -most, most);
+    J.beyond = J.rest > 0.9 ? std::max(0.0, std::abs(J.steady) - std::sqrt(3.0 * V_rest)) / std::sqrt(J.fast_variance + V - V_rest) : 0.0;
+    if (J.beyond < 3.0) J.held = false;
+    if (J.beyond < 1.0) J.armed = elapsed_ >= config_.warm_up, J.within_ns = last_ns_;
 
     // Prediction and update of (p, b), or of b alone. Friction at rest is quick up to the bound, not beyond it.
     const double b_before = J.b;
@@ -301,10 +332,11 @@ class ContactDetector {
       const Sum* first = nullptr;
       for (std::size_t k = 0; k < J.sums.size(); ++k)  // of those that alarm the latest start is the sharpest
         if (J.sums[k].g > h_[k / 2] && (first == nullptr || J.sums[k].since_ns > first->since_ns)) first = &J.sums[k];
-      if (first == nullptr) continue;
+      J.held = first == nullptr && J.armed && J.beyond > most_beyond_;
+      if (first == nullptr && !J.held) continue;
       J.feels = alarm = true;
-      if (!contact_.active) J.base = J.rest > 0.5 ? J.stiction(first->b) : first->b;
-      onset = std::min(onset, first->since_ns);
+      if (!contact_.active) J.base = J.held ? J.center : J.rest > 0.5 ? J.stiction(first->b) : first->b;
+      onset = std::min(onset, J.held ? J.within_ns : first->since_ns);
     }
     if (alarm && !contact_.active) {
       contact_.active = true;
@@ -331,7 +363,7 @@ class ContactDetector {
       const double std = std::sqrt(J.fast_variance + J.wandered + J.renewed);
       // Of a joint at rest anything within the bound may be stiction.
       const double stiction = J.rest > 0.5 ? J.fast - J.stiction(J.fast) : c[u(j)];
-      quiet = quiet && std::min(std::abs(c[u(j)]) - 3.0 * std, std::abs(stiction) - 3.0 * std::sqrt(J.fast_variance)) < 0.0;
+      quiet = quiet && !J.held && std::min(std::abs(c[u(j)]) - 3.0 * std, std::abs(stiction) - 3.0 * std::sqrt(J.fast_variance)) < 0.0;
       double shaken = 0.0;
       for (int i = 0; i < n; ++i)
         if (i != j && config_.source == ContactSource::momentum) shaken += fraction * std::abs(M_(j, i) / M_(i, i) * c[u(i)]);
@@ -354,7 +386,7 @@ class ContactDetector {
         J.P_bb += J.fast_variance + J.wandered + J.renewed;
         J.P_pb = 0.0;
         J.sums = {};
-        J.feels = false;
+        J.feels = J.armed = J.held = false;
         J.felt = 0.0;
       }
     }
@@ -426,6 +458,7 @@ class ContactDetector {
       contact_.std[u(j)] = std::sqrt(J.fast_variance + J.wandered + J.renewed + J.P_bb);
       double level = J.feels ? 1.0 : 0.0;
       for (std::size_t k = 0; !J.feels && k < J.sums.size(); ++k) level = std::max(level, h_[k / 2] > 0.0 ? J.sums[k].g / h_[k / 2] : 0.0);
+      if (!J.feels && J.armed && most_beyond_ > 0.0) level = std::max(level, J.beyond / most_beyond_);
       contact_.level[u(j)] = level;
     }
     return contact_;
@@ -438,6 +471,7 @@ class ContactDetector {
   JointMatrix M_{};
   JointVector M_at_{}, beta_{}, tau_{};
   double mean_dt_ = 0.0, threshold_dt_ = 0.0, elapsed_ = 0.0;
+  double most_beyond_ = 0.0;
   std::array<double, 4> h_{};
   std::int64_t last_ns_ = 0, felt_ns_ = 0;
   bool known_ = false;

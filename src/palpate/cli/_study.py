@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +24,15 @@ Out = Annotated[Path, typer.Option(metavar="DIR", help="Folder for NAME.html, NA
 Quick = Annotated[
     bool, typer.Option("--quick", help="Few repetitions, to see that it works; no row is judged.")
 ]
+Hours = Annotated[
+    float | None,
+    typer.Option(
+        metavar="H",
+        help="Simulate so long instead of the hours asked for (contacts only); what is done is kept in --out, and "
+        "a run with more hours goes on from there.",
+        show_default=False,
+    ),
+]
 Page = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Also keep the tables in this Markdown page, one section per study."),
@@ -39,6 +50,7 @@ def run(
     listing: bool,
     json: bool,
     quiet: bool,
+    hours: float | None = None,
 ) -> int:
     """Run the studies of a verb; 1 if a row misses."""
     from ..studies import STUDIES
@@ -61,8 +73,18 @@ def run(
                 else f"no study {name!r}; {suggest(name, known, 'there are')}"
             )
         chosen.append(known[name])
+    if hours is not None:
+        if not (math.isfinite(hours) and hours > 0.0):
+            raise InputError(f"--hours: expected a number > 0, got {hours:g}")
+        if quick:
+            raise InputError("--hours and --quick: a quick run has its own length; give one of them")
+        if fixed := [study.name for study in chosen if not study.campaign]:
+            able = ", ".join(s.name for s in known.values() if s.campaign)
+            raise InputError(f"--hours: {', '.join(fixed)} runs for a fixed time; a campaign is: {able}")
     make_folder(out)
-    results = [(study, *_measure(study, out, quick=quick, silent=json or quiet)) for study in chosen]
+    results = [
+        (study, *_measure(study, out, quick=quick, hours=hours, silent=json or quiet)) for study in chosen
+    ]
     if page is not None:
         from ..report import markdown_table, update_markdown
 
@@ -78,11 +100,14 @@ def run(
     return 0 if ok else 1
 
 
-def _measure(study: Study, out: Path, *, quick: bool, silent: bool) -> tuple[StudyResult, dict[str, str]]:
+def _measure(
+    study: Study, out: Path, *, quick: bool, hours: float | None, silent: bool
+) -> tuple[StudyResult, dict[str, str]]:
     """Run one study and write it; print it unless silent."""
     from ..report import write_study
 
-    result = study.run(None if silent else _Bar(study.name), quick=quick)
+    campaign: dict[str, Any] = {"folder": out, "hours": hours} if study.campaign else {}
+    result = study.run(None if silent else _Bar(study.name), quick=quick, **campaign)
     written = write_study(
         result.rows,
         result.figures,
@@ -98,16 +123,21 @@ def _measure(study: Study, out: Path, *, quick: bool, silent: bool) -> tuple[Stu
 
 
 class _Bar:
-    """A progress bar with the time left: made by the first call, taken away by the last; none without a terminal."""
+    """How far a study is, and the time left: a bar that goes away; without a terminal a line on stderr every minute."""
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._bar: Any = None
         self._row: Any = None
+        self._told = time.monotonic()
 
     def __call__(self, done: int, total: int, seconds_left: float) -> None:
         out = console()
+        left = f"{_time(seconds_left)} left" if math.isfinite(seconds_left) else ""
         if not out.is_terminal:
+            if left and time.monotonic() - self._told >= 60.0:
+                self._told = time.monotonic()
+                sys.stderr.write(f"{self._name}: {done} of {total} jobs, {left}\n")
             return
         if self._bar is None:
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -122,7 +152,6 @@ class _Bar:
             )
             self._bar.start()
             self._row = self._bar.add_task(self._name, total=total, left="")
-        left = f"{_time(seconds_left)} left" if math.isfinite(seconds_left) else ""
         self._bar.update(self._row, completed=done, total=total, left=left)
         if done >= total:
             self._bar.stop()

@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from ._common import Json, Quiet, examples
-from ._study import List, Names, Out, Page, Quick
+from ._study import Hours, List, Names, Out, Page, Quick
 from ._study import run as run_studies
 
 
@@ -17,7 +17,12 @@ def add(app: typer.Typer) -> None:
         "bench",
         help="Measure what palpate claims.\n\n"
         "Writes a page, a Markdown table and JSON per study. Exit code 1 if a row misses.",
-        epilog=examples("palpate bench --list", "palpate bench payload-filter", "palpate bench --quick"),
+        epilog=examples(
+            "palpate bench --list",
+            "palpate bench payload-filter",
+            "palpate bench contacts --hours 10",
+            "palpate bench --quick",
+        ),
     )(run)
 
 
@@ -26,11 +31,20 @@ def run(
     out: Out = Path("results"),
     page: Page = None,
     quick: Quick = False,
+    hours: Hours = None,
     listing: List = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Bench."""
     return run_studies(
-        "bench", names, out=out, page=page, quick=quick, listing=listing, json=json, quiet=quiet
+        "bench",
+        names,
+        out=out,
+        page=page,
+        quick=quick,
+        hours=hours,
+        listing=listing,
+        json=json,
+        quiet=quiet,
     )

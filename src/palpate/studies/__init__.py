@@ -13,9 +13,11 @@ import importlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
+from ..errors import InputError
 from ..report.study import StudyRow as Row
 
 if TYPE_CHECKING:
@@ -58,20 +60,35 @@ class Study:
     """the command it belongs to: ``palpate reproduce NAME`` or ``palpate bench NAME``"""
     module: str = ""
     """within palpate.studies; empty: the name with underscores"""
+    campaign: bool = False
+    """it simulates for hours, as many as are wanted, and can keep what is done to go on another time"""
 
-    def run(self, progress: Progress | None = None, quick: bool = False) -> StudyResult:
+    def run(
+        self,
+        progress: Progress | None = None,
+        quick: bool = False,
+        *,
+        folder: Path | None = None,
+        hours: float | None = None,
+    ) -> StudyResult:
         """Measure.
 
         Args:
             progress: told after every job how far it is.
             quick: few repetitions, to see that it works. The rows then say so and judge nothing.
+            folder: where a campaign keeps what is done; None: nowhere.
+            hours: simulated by a campaign [h]; None: as many as its figure asks for.
 
         Raises:
+            InputError: hours are given for a study that is no campaign.
             MissingExtraError: the study needs an extra, mostly ``sim``.
         """
         module = importlib.import_module(f"{__name__}.{self.module or self.name.replace('-', '_')}")
+        if hours is not None and not self.campaign:
+            raise InputError(f"study {self.name!r} is no campaign: its length is fixed")
+        options = {"folder": folder, "hours": hours} if self.campaign else {}
         begin = time.perf_counter()
-        rows, figures, notes = module.run(progress or _silent, quick)
+        rows, figures, notes = module.run(progress or _silent, quick, **options)
         if quick:
             rows = [
                 replace(row, ok=None, note=f"quick run, not comparable; {row.note}".rstrip("; "))
@@ -99,7 +116,12 @@ _ALL = (
     Study("unknown-grasp", "The object is not held where it was thought", "bench"),
     Study("wrong-masses", "The arm's links do not weigh what the model says", "bench"),
     Study("grasp-and-release", "An object is taken and dropped at unknown times", "bench"),
-    Study("contacts", "Contacts found and not found: a real UR10e, and 100 h of two simulated arms", "bench"),
+    Study(
+        "contacts",
+        "Contacts found and not found: a real UR10e, and 100 h of two simulated arms",
+        "bench",
+        campaign=True,
+    ),
     Study("feedback", "What is weighed is fed back to the controller", "bench"),
     Study("box-inertias", "The same arm with inertias a body can have", "bench"),
     Study(

@@ -312,8 +312,16 @@ class Work:
             else None
         )
 
-    def map(self, function: Callable[[In], Out], jobs: Iterable[In]) -> list[Out]:
+    def map(
+        self,
+        function: Callable[[In], Out],
+        jobs: Iterable[In],
+        each: Callable[[int, Out], None] | None = None,
+    ) -> list[Out]:
         """function(job) of every job; the function belongs to a module, jobs and results can be pickled.
+
+        Args:
+            each: told the number of a job and its result as soon as it is there, in no order.
 
         Raises:
             Exception: the first that a job raised; the jobs that have not begun are dropped.
@@ -321,14 +329,19 @@ class Work:
         """
         if self._pool is None:
             results = []
-            for job in jobs:
+            for k, job in enumerate(jobs):
                 results.append(function(job))
+                if each is not None:
+                    each(k, results[k])
                 self._tick()
             return results
         try:
             futures: list[Future[Out]] = [self._pool.submit(function, job) for job in jobs]
+            number = {future: k for k, future in enumerate(futures)}
             for future in as_completed(futures):
-                future.result()
+                result = future.result()
+                if each is not None:
+                    each(number[future], result)
                 self._tick()
         except BrokenProcessPool:
             raise PalpateError(

@@ -20,7 +20,7 @@ def describe_noise(arm: Arm, log: Log) -> tuple[Arm, str]:
     """The arm with the noise of a log in every joint whose sensing is not described; a torque that is, is kept.
 
     Resolution is the step that positions lie on; the rest is what third differences hold beside a smooth motion:
-    of white noise of deviation s they have the deviation sqrt(20) s.
+    of white noise of deviation s they have the deviation sqrt(20) s, weighted for uneven time stamps likewise.
 
     Returns:
         the arm, and what was done; "" if everything was described.
@@ -34,16 +34,16 @@ def describe_noise(arm: Arm, log: Log) -> tuple[Arm, str]:
     if not unknown or len(log) < 100:
         return arm, ""
     gain = arm.effort.gain(arm.n)
-    joints = list(arm.joints)
+    joints, seconds = list(arm.joints), log.seconds
     for i in unknown:
         position, torque = log.position[:, i], log.effort[:, i] * gain[i]
         step = _step(position)
-        noise = _noise(position)
+        noise = _noise(position, seconds)
         position_std = max(math.sqrt(max(noise**2 - step**2 / 12.0, 0.0)), _LEAST_POSITION)
         good = torque[np.isfinite(torque) & (np.abs(torque) < 1e9)]
         size = float(np.percentile(np.abs(good), 95.0)) if good.size else 0.0
-        torque_std = max(_noise(torque), _LEAST_TORQUE * size, 1e-6)
-        velocity = None if log.velocity is None else max(_noise(log.velocity[:, i]), 1e-4)
+        torque_std = max(_noise(torque, seconds), _LEAST_TORQUE * size, 1e-6)
+        velocity = None if log.velocity is None else max(_noise(log.velocity[:, i], seconds), 1e-4)
         told = joints[i].sensing
         if told.torque_std or told.torque_resolution:
             found = replace(told, position_resolution=step, position_std=position_std, velocity_std=velocity)
@@ -58,15 +58,30 @@ def describe_noise(arm: Arm, log: Log) -> tuple[Arm, str]:
     )
 
 
-def _noise(values: Array) -> float:
-    """Standard deviation of the white part of (N,)."""
-    third = np.diff(values, n=3)
+def _noise(values: Array, seconds: Array) -> float:
+    """Standard deviation of the white part of (N,), sampled when the stamps say or evenly, whichever is smoother."""
+    if len(values) < 4:
+        return 0.0
+    four = np.lib.stride_tricks.sliding_window_view(seconds, 4)
+    distances = four[:, :, None] - four[:, None, :] + np.eye(4)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        stamped = 1.0 / distances.prod(
+            axis=2
+        )  # of a divided difference: a parabola leaves nothing at any times
+        stamped /= np.sqrt(np.square(stamped).sum(axis=1, keepdims=True))
+    even = np.broadcast_to(np.array([-1.0, 3.0, -3.0, 1.0]) / math.sqrt(20.0), stamped.shape)
+    around = np.lib.stride_tricks.sliding_window_view(values, 4)
+    return min(_spread((weights * around).sum(axis=1)) for weights in (stamped, even))
+
+
+def _spread(third: Array) -> float:
+    """RMS of (N,) third differences."""
     third = third[np.isfinite(third)]
     if third.size < 10:
         return 0.0
     # without the largest: jumps and absurd numbers are no noise
     kept = np.sort(np.abs(third))[: max(int(0.98 * third.size), 10)]
-    return float(np.sqrt(np.mean(np.square(kept)) / 20.0)) if kept[-1] < 1e6 else 0.0
+    return float(np.sqrt(np.mean(np.square(kept)))) if kept[-1] < 1e6 else 0.0
 
 
 def _step(values: Array) -> float:
