@@ -1,0 +1,29 @@
+"""Wiping a whiteboard: where to go with the eraser, and what that does to the ink. Needs ``palpate[wipe]``.
+
+>>> from palpate import vision, wipe
+>>> sight = vision.see(vision.load("photo.jpg"), size=(0.90, 0.60))  # doctest: +SKIP
+>>> wipe.plan(sight.ink_polygons, (0.90, 0.60), keep=sight.object_polygons).legs  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from .choice import COLOURS, Choice, choose, ink_colours
+from .reach import Reach, reachable, tool_poses
+from .strokes import Eraser, Leg, Motion, Phase, Plan, plan, swept
+
+__all__ = [
+    "COLOURS",
+    "Choice",
+    "Eraser",
+    "Leg",
+    "Motion",
+    "Phase",
+    "Plan",
+    "Reach",
+    "choose",
+    "ink_colours",
+    "plan",
+    "reachable",
+    "swept",
+    "tool_poses",
+]
