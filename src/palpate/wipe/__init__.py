@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 from .choice import COLOURS, Choice, choose, ink_colours
+from .ink import InkLayer, handwriting
 from .reach import Reach, reachable, tool_poses
 from .strokes import Eraser, Leg, Motion, Phase, Plan, plan, swept
 
@@ -15,12 +16,14 @@ __all__ = [
     "COLOURS",
     "Choice",
     "Eraser",
+    "InkLayer",
     "Leg",
     "Motion",
     "Phase",
     "Plan",
     "Reach",
     "choose",
+    "handwriting",
     "ink_colours",
     "plan",
     "reachable",

@@ -2,7 +2,7 @@
 
 Everything is in board coordinates [m]: origin in the writing surface's top left corner, x along the top edge, y down
 the left edge (those of :mod:`palpate.vision`). The eraser is a rectangle that keeps its orientation. A place counts as
-wiped when the eraser slides over it for at least a stated distance, because felt that only sits on ink takes nothing off.
+wiped when the eraser slides over it for at least a stated distance: felt that only sits on ink takes nothing off.
 """
 
 from __future__ import annotations
