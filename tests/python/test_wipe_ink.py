@@ -142,6 +142,15 @@ def test_handwriting_is_seen_where_it_is(seed):
     assert (found & ~cv2.dilate(layer.visible.astype(np.uint8), np.ones((9, 9))).astype(bool)).sum() == 0
 
 
+@pytest.mark.parametrize("width", [0.002, 0.005, 0.02])
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_a_stroke_is_as_wide_as_asked(width, turn):
+    layer = wipe.InkLayer((0.3, 0.2))
+    layer.stroke(np.array([0.15, 0.1]) + np.outer([-0.08, 0.08], [np.cos(turn), np.sin(turn)]), width=width)
+    wanted = 0.16 * width + 0.25 * np.pi * width**2  # with round ends
+    assert layer.amount.sum() * layer.texel**2 == pytest.approx(wanted, rel=0.15)
+
+
 def test_a_clean_layer_looks_clean():
     layer = wipe.InkLayer((0.9, 0.6))
     ink.handwriting(layer, 1)

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from .choice import COLOURS, Choice, choose, ink_colours
 from .ink import InkLayer, handwriting
-from .reach import Reach, reachable, tool_poses
+from .reach import Reach, inverse_kinematics, reachable, tool_poses
+from .scene import BoardScene, Setting
 from .strokes import Eraser, Leg, Motion, Phase, Plan, plan, swept
 
 __all__ = [
     "COLOURS",
+    "BoardScene",
     "Choice",
     "Eraser",
     "InkLayer",
@@ -22,9 +24,11 @@ __all__ = [
     "Phase",
     "Plan",
     "Reach",
+    "Setting",
     "choose",
     "handwriting",
     "ink_colours",
+    "inverse_kinematics",
     "plan",
     "reachable",
     "swept",

@@ -45,7 +45,7 @@ _WORDS = (
     "torque = inertia", "ask Ana", "call 4711", "milk, eggs", "Tuesday 9:30", "F = m a", "done?", "see page 12",
     "v = dx/dt", "new batch", "do not erase", "plan B", "x + y < 3", "thanks!",
 )  # fmt: skip
-_SUBTEXEL = 4  # bits of a texel's fraction in cv2's drawing
+_FINER = 4  # lines are drawn so many times finer
 
 
 @dataclass(slots=True, eq=False)
@@ -93,10 +93,13 @@ class InkLayer:
         line = np.atleast_2d(np.asarray(points, dtype=np.float64))
         if line.ndim != 2 or line.shape[1] != 2 or not np.all(np.isfinite(line)):
             raise InputError(f"a stroke's points must be finite and (K, 2) [m], got shape {line.shape}")
-        mask = np.zeros(self.amount.shape, np.uint8)
-        at = np.rint((line / self.texel - 0.5) * (1 << _SUBTEXEL)).astype(np.int32)
-        pen = max(1, round(_positive(width, "width of a stroke") / self.texel))
-        cv2.polylines(mask, [at], False, 255, pen, cv2.LINE_AA, _SUBTEXEL)
+        # OpenCV's smooth lines are two pixels too wide: a fine plain one, made small, is not
+        rows, columns = self.amount.shape
+        fine = np.zeros((_FINER * rows, _FINER * columns), np.uint8)
+        at = np.rint(line / self.texel * _FINER - 0.5).astype(np.int32)
+        pen = max(1, round(_positive(width, "width of a stroke") / self.texel * _FINER))
+        cv2.polylines(fine, [at], False, 255, pen, cv2.LINE_8)
+        mask = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)
         self._add(mask.astype(np.float32) / 255.0, colour, amount, toughness)
 
     def text(

@@ -81,16 +81,7 @@ def reachable(
     points = _samples(plan)
     if not len(points):
         return Reach(True, "", np.zeros((0, arm.n)), points, 0.0, math.nan)
-    lower = np.array([j.limits.lower for j in arm.joints]) + margin
-    upper = np.array([j.limits.upper for j in arm.joints]) - margin
-    low, high = np.clip(lower, -math.pi, math.pi), np.clip(upper, -math.pi, math.pi)
-    rng = np.random.default_rng(0)
-    seeds = low + rng.random((SEEDS, arm.n)) * (high - low)
-    if q is not None:
-        here = np.asarray(q, dtype=np.float64)
-        if here.shape != (arm.n,) or not np.all(np.isfinite(here)):
-            raise InputError(f"q must be ({arm.n},) and finite, got shape {here.shape}")
-        seeds = np.concatenate((here[None], seeds))
+    lower, upper, seeds = _limits(arm, q, margin)
     best: Reach | None = None
     for turn in (0.0, math.pi):
         poses = tool_poses(points, T, plan.angle + turn)
@@ -115,6 +106,48 @@ def reachable(
             math.nan,
         )
     return best
+
+
+def inverse_kinematics(
+    arm: Arm, T_base_tool: npt.ArrayLike, *, q: npt.ArrayLike | None = None, margin: float = 0.05
+) -> Array | None:
+    """Joint positions (n,) [rad] that bring the grasp point to a pose (4, 4); None: no pose of the arm was found.
+
+    Args:
+        arm: the arm.
+        T_base_tool: of the grasp point, axes of the tip frame [m].
+        q: (n,) to be near to; None: as far from singular poses as can be.
+        margin: distance to keep from the joints' limits [rad].
+
+    Raises:
+        InputError: something has the wrong shape.
+    """
+    pose = np.asarray(T_base_tool, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
+        raise InputError(f"T_base_tool must be (4, 4) and finite, got shape {pose.shape}")
+    lower, upper, seeds = _limits(arm, q, margin)
+    found = _solve(arm, np.repeat(pose[None], len(seeds), 0), seeds, lower, upper)
+    found = found[_near(arm, found, pose[None])]
+    if not len(found):
+        return None
+    if q is None:
+        return found[int(np.argmax(_manipulability(arm, found)))]
+    return found[int(np.argmin(np.linalg.norm(found - np.asarray(q, dtype=np.float64), axis=1)))]
+
+
+def _limits(arm: Arm, q: npt.ArrayLike | None, margin: float) -> tuple[Array, Array, Array]:
+    """Limits with a margin, and poses to start from; the one that the arm is in is the first."""
+    lower = np.array([j.limits.lower for j in arm.joints]) + margin
+    upper = np.array([j.limits.upper for j in arm.joints]) - margin
+    low, high = np.clip(lower, -math.pi, math.pi), np.clip(upper, -math.pi, math.pi)
+    rng = np.random.default_rng(0)
+    seeds = low + rng.random((SEEDS, arm.n)) * (high - low)
+    if q is not None:
+        here = np.asarray(q, dtype=np.float64)
+        if here.shape != (arm.n,) or not np.all(np.isfinite(here)):
+            raise InputError(f"q must be ({arm.n},) and finite, got shape {here.shape}")
+        seeds = np.concatenate((here[None], seeds))
+    return lower, upper, seeds
 
 
 def _samples(plan: Plan) -> Array:
