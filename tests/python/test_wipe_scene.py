@@ -21,7 +21,7 @@ UP = np.zeros(7)  # both arms upright: the camera sees the whole board
 
 def make(**setting):
     layer = wipe.InkLayer((0.5, 0.35))
-    layer.stroke([[0.1, 0.17], [0.4, 0.17]], width=0.02)
+    layer.stroke([[0.1, 0.17], [0.4, 0.17]], width=0.012)
     layer.stroke([[0.1, 0.30], [0.4, 0.30]], width=0.005, colour="red")
     return wipe.BoardScene(layer, wipe.Setting(**setting))
 
@@ -213,6 +213,24 @@ def test_vision_sees_the_board_where_it_is(seen, tilt):
     scene.close()
 
 
+def test_magnets_are_seen_and_gone_around(seen):
+    scene = make(magnets=((0.25, 0.21),))
+    sight = vision.see(seen(scene), size=scene.ink.size, camera=scene.camera)
+    assert len(sight.object_polygons) == 1
+    assert (
+        np.linalg.norm(sight.object_polygons[0].mean(0) - [0.25, 0.21]) < 0.012
+    )  # it stands up from the board
+    chosen = wipe.choose(sight.ink_polygons, objects=sight.object_polygons)
+    plan = wipe.plan(chosen.wipe, scene.ink.size, keep=chosen.keep)
+    for leg in plan.legs:
+        if leg.phase == "slide":
+            for s in np.linspace(0.0, 1.0, 20):
+                off = np.abs(leg.start[:2] + s * (leg.end - leg.start)[:2] - [0.25, 0.21])
+                gap = np.maximum(off - 0.5 * np.array(plan.footprint), 0.0)
+                assert np.linalg.norm(gap) > 0.5 * module.MAGNET[0]
+    scene.close()
+
+
 def test_pictures_show_the_ink_as_it_is_now(seen):
     scene = make()
     first = seen(scene)
@@ -230,6 +248,7 @@ def test_pictures_show_the_ink_as_it_is_now(seen):
     ("call", "message"),
     [
         (lambda: wipe.Setting(friction=0.0), "setting: friction must be finite and > 0, got 0.0"),
+        (lambda: wipe.Setting(magnets=((0.1,),)), "setting: magnets must be places (x, y) [m]"),
         (lambda: wipe.Setting(tilt=1.0), "setting: tilt must be at most 45 degrees"),
         (lambda: make().reset(UP, np.zeros(6)), "q of the holder must be (7,) and finite, got (6,)"),
         (

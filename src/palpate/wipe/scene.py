@@ -44,6 +44,8 @@ STIFFNESS = 600.0
 """of the whole felt [N/m]"""
 TRAVEL = 0.012
 """of a pad [m]"""
+MAGNET = (0.014, 0.009)
+"""radius and height of a magnet [m]"""
 GRIP = 0.012
 """the gripper's point must be so near the board's rim to hold it [m]"""
 HOLDER = (1.5, 0.0, 0.0)
@@ -62,6 +64,8 @@ class Setting:
     """of the board about the vertical; 0: its top edge is away from the eraser's arm [rad]"""
     tilt: float = 0.0
     """of the table, the edge away from the eraser's arm up [rad]"""
+    magnets: tuple[tuple[float, float], ...] = ()
+    """where magnets are, board coordinates [m]: discs of MAGNET that the felt cannot pass"""
     mass: float = 1.5
     """of the board [kg]"""
     friction: float = 0.4
@@ -88,6 +92,8 @@ class Setting:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise InputError(f"setting: {name} must be finite and >= 0, got {value!r}")
+        if np.asarray(self.magnets, dtype=object).size and np.shape(self.magnets)[1:] != (2,):
+            raise InputError(f"setting: magnets must be places (x, y) [m], got {self.magnets!r}")
         if not abs(self.tilt) <= math.radians(45.0):
             raise InputError(f"setting: tilt must be at most 45 degrees (0.785 rad), got {self.tilt!r} rad")
 
@@ -419,7 +425,7 @@ class BoardScene:
         self._eye(spec)
 
     def _surface(self, spec: Any, board: Any) -> None:
-        """The writing surface with the ink on it, and the frame around it; nothing here collides."""
+        """The writing surface with the ink on it, the frame around it, which nothing touches, and magnets."""
         mj, (W, H) = self._mj, self.ink.size
         rows, columns = self.ink.amount.shape
         spec.add_texture(
@@ -464,6 +470,17 @@ class BoardScene:
                 rgba=(0.36, 0.38, 0.41, 1.0),
                 contype=0,
                 conaffinity=0,
+            )
+
+        for x, y in self.setting.magnets:
+            board.add_geom(
+                type=mj.mjtGeom.mjGEOM_CYLINDER,
+                size=(MAGNET[0], 0.5 * MAGNET[1], 0.0),
+                pos=(x - w, y - h, -0.5 * MAGNET[1]),
+                mass=0.01,
+                rgba=(0.75, 0.12, 0.1, 1.0),
+                contype=0,
+                conaffinity=1 | 2,
             )
 
     def _hands(self, spec: Any, box: Any) -> None:
