@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -261,6 +263,17 @@ def test_a_far_board_is_not_and_it_says_why(arm):
         arm, wipe.plan([np.array([[0.0, 0.1], [1.0, 0.1]])], (1.2, 0.25)), table(0.5, -0.2, 0.2)
     )
     assert not half.ok and "on the board" in half.reason and len(half.q)
+
+
+def test_without_the_extra_it_is_named():
+    code = (
+        "import sys; sys.modules['shapely'] = None\n"
+        "from palpate.errors import MissingExtraError\n"
+        "try: import palpate.wipe\n"
+        "except MissingExtraError as e: assert 'palpate[wipe]' in str(e)\n"
+        "else: raise AssertionError"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 @pytest.mark.parametrize(

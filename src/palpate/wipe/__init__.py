@@ -7,6 +7,15 @@
 
 from __future__ import annotations
 
+try:
+    import cv2 as _cv2  # noqa: F401  the rest of the package needs these
+    import scipy as _scipy  # noqa: F401
+    import shapely as _shapely  # noqa: F401
+except ImportError:
+    from ..errors import MissingExtraError
+
+    raise MissingExtraError("wipe", "wiping a board") from None
+
 from .choice import COLOURS, Choice, choose, ink_colours
 from .ink import InkLayer, handwriting
 from .reach import Reach, inverse_kinematics, reachable, tool_poses

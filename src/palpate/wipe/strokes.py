@@ -15,19 +15,12 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import shapely
+from shapely import Polygon, affinity, box
 
 from ..arm import Array
-from ..errors import InputError, MissingExtraError
-
-try:
-    import shapely
-    from shapely import Polygon, affinity, box
-
-    from . import _tour
-except ImportError as error:
-    if (error.name or "").partition(".")[0] not in ("shapely", "scipy"):
-        raise
-    raise MissingExtraError("wipe", "planning strokes") from None
+from ..errors import InputError
+from . import _tour
 
 _HAIR = 1e-7
 """[m] what rounding may be off"""
