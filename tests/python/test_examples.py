@@ -23,6 +23,7 @@ EXTRAS = {
     "data": "pooch",
     "identify": "scipy",
     "vision": "cv2",
+    "wipe": "shapely",
 }
 
 

@@ -27,6 +27,7 @@ _EXTRAS = {
     "xacro": (("xacro",), "arms from .xacro files"),
     "data": (("pooch",), "palpate data get"),
     "vision": (("cv2",), "whiteboards in pictures"),
+    "wipe": (("shapely", "scipy", "cv2"), "an eraser's strokes, ink, the board's scene"),
 }
 _DRAW = (
     "from palpate.simulate import Plant; from palpate import robots; "

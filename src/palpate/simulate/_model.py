@@ -144,7 +144,62 @@ def build(arm: Arm, *, limits: bool, contacts: bool, scene: Callable[[Any], None
     spec.option.gravity = (0.0, 0.0, -float(np.linalg.norm(arm.gravity)))
 
     R_world_base = upright(arm.gravity)
-    base = spec.worldbody.add_body(name="arm:base", quat=quaternion(R_world_base))
+    parts = add_arm(spec, arm, "arm:", quaternion(R_world_base), limits=limits, contacts=contacts)
+    extent = _draw(mj, spec, arm, R_world_base)
+    if scene is not None:
+        scene(spec)
+    model = spec.compile()
+
+    built = Built(
+        model=model,
+        links=tuple(b.id for b in parts.links),
+        hands=tuple(b.id for b in parts.hands),
+        payload=parts.payload.id,
+        payload_geom=parts.held.id,
+        R_world_base=R_world_base,
+        extent=extent,
+    )
+    write_arm(model, arm, parts)
+    return built
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """An arm in a MjSpec."""
+
+    links: tuple[Any, ...]
+    """bodies of the base and of every link"""
+    hands: tuple[Any, ...]
+    """massless bodies at which wrenches act, one for every link"""
+    payload: Any
+    """body of what is held; its frame is the arm's tip frame"""
+    held: Any
+    """its geom"""
+
+
+def add_arm(
+    spec: Any,
+    arm: Arm,
+    prefix: str,
+    quat: Array,
+    *,
+    pos: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    limits: bool,
+    contacts: bool,
+) -> Parts:
+    """Put an arm into a MjSpec; once it is compiled, :func:`write_arm` gives the bodies their masses.
+
+    Args:
+        spec: the MjSpec.
+        arm: the arm.
+        prefix: of the names of bodies and joints.
+        quat: of the base, (w, x, y, z) in the world.
+        pos: of the base [m].
+        limits: end stops at the joints' limits.
+        contacts: the arm's shapes and the held object collide with the scene.
+    """
+    mj = mujoco()
+    base = spec.worldbody.add_body(name=f"{prefix}base", pos=pos, quat=quat)
     links, hands, body = [base], [], base
     # off the origin and off the axes, so that the compiler takes no shortcut; the real ones are written below
     stand_in = {
@@ -157,8 +212,10 @@ def build(arm: Arm, *, limits: bool, contacts: bool, scene: Callable[[Any], None
     }
     for joint in arm.joints:
         T = joint.T_parent_joint
-        body = body.add_body(name=f"arm:{joint.link}", pos=T[:3, 3], quat=quaternion(T[:3, :3]), **stand_in)
-        hinge = body.add_joint(name=f"arm:{joint.name}", axis=joint.axis, armature=joint.rotor_inertia)
+        body = body.add_body(
+            name=f"{prefix}{joint.link}", pos=T[:3, 3], quat=quaternion(T[:3, :3]), **stand_in
+        )
+        hinge = body.add_joint(name=f"{prefix}{joint.name}", axis=joint.axis, armature=joint.rotor_inertia)
         hinge.type = mj.mjtJoint.mjJNT_HINGE if joint.kind == "revolute" else mj.mjtJoint.mjJNT_SLIDE
         hinge.damping[0] = joint.friction.viscous
         hinge.frictionloss = joint.friction.coulomb
@@ -170,39 +227,38 @@ def build(arm: Arm, *, limits: bool, contacts: bool, scene: Callable[[Any], None
             hinge.solref_limit = _END_STOP_SOLREF
         links.append(body)
     for joint, link in zip(arm.joints, links[1:], strict=True):
-        hands.append(link.add_body(name=f"arm:{joint.link}:push"))
+        hands.append(link.add_body(name=f"{prefix}{joint.link}:push"))
     tip = arm.T_last_tip
-    payload = links[-1].add_body(name="arm:payload", pos=tip[:3, 3], quat=quaternion(tip[:3, :3]), **stand_in)
+    payload = links[-1].add_body(
+        name=f"{prefix}payload", pos=tip[:3, 3], quat=quaternion(tip[:3, :3]), **stand_in
+    )
     # against the scene's geoms (1 and 1 by default), not against one another
     collide = {"contype": int(contacts), "conaffinity": 0}
     held = payload.add_geom(
-        name="arm:payload", type=mj.mjtGeom.mjGEOM_BOX, size=(0.01,) * 3, rgba=HIDDEN_COLOUR, **collide
+        name=f"{prefix}payload", type=mj.mjtGeom.mjGEOM_BOX, size=(0.01,) * 3, rgba=HIDDEN_COLOUR, **collide
     )
-
-    extent = _draw(mj, spec, arm, links, collide, R_world_base)
-    if scene is not None:
-        scene(spec)
-    model = spec.compile()
-
-    built = Built(
-        model=model,
-        links=tuple(b.id for b in links),
-        hands=tuple(b.id for b in hands),
-        payload=payload.id,
-        payload_geom=held.id,
-        R_world_base=R_world_base,
-        extent=extent,
-    )
-    for joint, body_id in zip(arm.joints, built.links[1:], strict=True):
-        write_inertial(model, body_id, joint.mass, joint.com, joint.inertia)
-    write_inertial(model, built.payload, 0.0, np.zeros(3), np.zeros((3, 3)))
-    return built
+    _draw_arm(mj, arm, links, collide)
+    return Parts(tuple(links), tuple(hands), payload, held)
 
 
-def _draw(
-    mj: ModuleType, spec: Any, arm: Arm, links: list[Any], collide: dict[str, int], R_world_base: Array
-) -> float:
-    """Add geoms for the arm's shapes, sky, floor and lights; return the arm's reach [m]."""
+def write_arm(model: Any, arm: Arm, parts: Parts) -> None:
+    """Give the bodies of an arm their masses and let it hold nothing. mj_setConst must follow."""
+    for joint, link in zip(arm.joints, parts.links[1:], strict=True):
+        write_inertial(model, link.id, joint.mass, joint.com, joint.inertia)
+    write_inertial(model, parts.payload.id, 0.0, np.zeros(3), np.zeros((3, 3)))
+
+
+def _ends(arm: Arm) -> tuple[list[Array], float]:
+    """Where each link ends, in its own frame: the next joint, or the grasp point; and the arm's reach [m]."""
+    ends = [j.T_parent_joint[:3, 3] for j in arm.joints[1:]] + [
+        arm.T_last_tip[:3, :3] @ arm.grasp + arm.T_last_tip[:3, 3]
+    ]
+    first = arm.joints[0].T_parent_joint[:3, 3]
+    return ends, float(sum(np.linalg.norm(e) for e in [first, *ends]))
+
+
+def _draw_arm(mj: ModuleType, arm: Arm, links: list[Any], collide: dict[str, int]) -> None:
+    """Add geoms for the arm's shapes, and for links that have none."""
     kinds = {
         "box": mj.mjtGeom.mjGEOM_BOX,
         "cylinder": mj.mjtGeom.mjGEOM_CYLINDER,
@@ -231,12 +287,8 @@ def _draw(
         )
         drawn.add(shape.link)
 
-    # ends[i] is where link i ends, in its own frame: the next joint, or the grasp point
-    ends = [j.T_parent_joint[:3, 3] for j in arm.joints[1:]] + [
-        arm.T_last_tip[:3, :3] @ arm.grasp + arm.T_last_tip[:3, 3]
-    ]
+    ends, reach = _ends(arm)
     first = arm.joints[0].T_parent_joint[:3, 3]
-    reach = float(sum(np.linalg.norm(e) for e in [first, *ends]))
     radius = max(0.04 * reach, 0.005)
     segments = [(-1, first), *enumerate(ends)]
     for link, end in segments:
@@ -259,6 +311,10 @@ def _draw(
             knob.alt.zaxis = z
             knob.alt.type = mj.mjtOrientation.mjORIENTATION_ZAXIS
 
+
+def _draw(mj: ModuleType, spec: Any, arm: Arm, R_world_base: Array) -> float:
+    """Add sky, floor and lights; return the arm's reach [m]."""
+    ends, reach = _ends(arm)
     # the floor goes below everything the straight arm touches; an arm that hangs gets room to swing
     T = np.eye(4)
     T[:3, :3] = R_world_base

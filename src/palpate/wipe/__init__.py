@@ -1,0 +1,45 @@
+"""Wiping a whiteboard: where to go with the eraser, and what that does to the ink. Needs ``palpate[wipe]``.
+
+>>> from palpate import vision, wipe
+>>> sight = vision.see(vision.load("photo.jpg"), size=(0.90, 0.60))  # doctest: +SKIP
+>>> wipe.plan(sight.ink_polygons, (0.90, 0.60), keep=sight.object_polygons).legs  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+try:
+    import cv2 as _cv2  # noqa: F401  the rest of the package needs these
+    import scipy as _scipy  # noqa: F401
+    import shapely as _shapely  # noqa: F401
+except ImportError:
+    from ..errors import MissingExtraError
+
+    raise MissingExtraError("wipe", "wiping a board") from None
+
+from .choice import COLOURS, Choice, choose, ink_colours
+from .ink import InkLayer, handwriting
+from .reach import Reach, inverse_kinematics, reachable, tool_poses
+from .scene import BoardScene, Setting
+from .strokes import Eraser, Leg, Motion, Phase, Plan, plan, swept
+
+__all__ = [
+    "COLOURS",
+    "BoardScene",
+    "Choice",
+    "Eraser",
+    "InkLayer",
+    "Leg",
+    "Motion",
+    "Phase",
+    "Plan",
+    "Reach",
+    "Setting",
+    "choose",
+    "handwriting",
+    "ink_colours",
+    "inverse_kinematics",
+    "plan",
+    "reachable",
+    "swept",
+    "tool_poses",
+]
