@@ -9,7 +9,7 @@ from pydantic import Field
 
 from .._card import Strict, read_yaml
 from ..errors import InputError
-from .bus import MAX_ID, Bus, Servo
+from .bus import BAUD, MAX_ID, MIDDLE, Bus, Servo
 
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
@@ -19,7 +19,7 @@ class _Servo(Strict):
     joint: str
     model: str | None = None
     direction: Literal[1, -1] = 1
-    zero: int = Servo.__dataclass_fields__["zero"].default
+    zero: int = MIDDLE
     gear: _Positive = 1.0
     torque_constant_Nm_A: _Positive | None = None
     current_limit_A: _Positive | None = None
@@ -27,7 +27,7 @@ class _Servo(Strict):
 
 class _Bus(Strict):
     palpate_bus: Literal[1]
-    baud: Annotated[int, Field(gt=0)] = Bus.__dataclass_fields__["baud"].default
+    baud: Annotated[int, Field(gt=0)] = BAUD
     servos: Annotated[tuple[_Servo, ...], Field(min_length=1)]
 
 

@@ -54,7 +54,8 @@ def open_port(handler: type, path: str, baud: int) -> Any:
     latency = _usb_latency_ms(path)
     if latency > 1.0:
         _logger.warning(
-            "%s collects answers for %g ms: 250 Hz cannot be reached; echo 1 | sudo tee /sys/class/tty/%s/device/latency_timer",
+            "%s collects answers for %g ms: 250 Hz cannot be reached; "
+            "echo 1 | sudo tee /sys/class/tty/%s/device/latency_timer",
             path,
             latency,
             Path(path).resolve().name,

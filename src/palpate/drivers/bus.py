@@ -16,7 +16,10 @@ from ..errors import InputError, suggest
 COUNTS_PER_TURN = 4096
 """of the position of every servo here"""
 RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
+MIDDLE = COUNTS_PER_TURN // 2
 MAX_ID = 252
+BAUD = 1_000_000
+"""unless told otherwise [bit/s]"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,7 +34,7 @@ class Servo:
     """as its maker calls it, e.g. XM430-W350; None: what the servo says"""
     direction: int = 1
     """+1, or -1 where the servo turns against the joint"""
-    zero: int = COUNTS_PER_TURN // 2
+    zero: int = MIDDLE
     """its position at joint position 0 [counts of 1/4096 turn]"""
     gear: float = 1.0
     """turns of the servo's horn per turn of the joint, > 0"""
@@ -46,11 +49,11 @@ class Bus:
     """The servos of an arm."""
 
     servos: tuple[Servo, ...]
-    baud: int = 1_000_000
+    baud: int = BAUD
     """[bit/s]"""
 
     @classmethod
-    def of(cls, arm: Arm, *, baud: int = 1_000_000) -> Bus:
+    def of(cls, arm: Arm, *, baud: int = BAUD) -> Bus:
         """Servos 1 to n for the joints in their order, in the joints' direction, in the middle at joint position 0."""
         return cls(servos=tuple(Servo(id=i + 1, joint=j) for i, j in enumerate(arm.joint_names)), baud=baud)
 
@@ -163,7 +166,9 @@ class JointMap:
 
     def torque(self, current: Array) -> Array:
         """(n,) [N m] from (S,) currents [A]."""
-        return np.bincount(self.joint, self._torque_per_ampere * current, minlength=len(self.lead))
+        found: Array = np.zeros(len(self.lead))
+        np.add.at(found, self.joint, self._torque_per_ampere * current)
+        return found
 
     def effort_of(self, current: Array) -> Array:
         """(n,) the driver's effort number [A] from (S,) currents [A]."""

@@ -114,8 +114,9 @@ class DynamixelDriver(ServoDriver):
     """Reads and commands Dynamixel servos; the SDK is the extra ``dynamixel``.
 
     Effort is the present current [A], with the joint's sign. connect() switches the torque of every servo off: hold the
-    arm. enable() puts them into current control, whose setting stays in the servo, and sets their watchdog: so long
-    after the last packet they stop by themselves, whatever has become of this program. A hardware error of any servo stops all.
+    arm. enable() puts them into current control, a setting that stays in the servo, and sets their watchdog: so long
+    after the last packet they stop by themselves, whatever has become of this program. A hardware error of any servo
+    stops all.
 
     Args:
         arm, port, bus, rate, patience: see :class:`~palpate.drivers.servos.ServoDriver`.
@@ -191,8 +192,8 @@ class DynamixelDriver(ServoDriver):
         wire = 10.0 / self._baud * ((14 + count) + count * (11 + _PRESENT[1]) + (14 + 3 * count))
         if wire + delay > 1e-9 * self._period_ns:
             raise DriverError(
-                f"{self._path}: {1e9 / self._period_ns:g} Hz cannot be reached: {count} servos take {1e3 * wire:.2g} ms "
-                f"on the wire and wait {1e3 * delay:.2g} ms before they answer; ask for a lower rate, a higher baud "
+                f"{self._path}: {1e9 / self._period_ns:g} Hz cannot be reached: {count} servos take {1e3 * wire:.2g} "
+                f"ms on the wire and wait {1e3 * delay:.2g} ms before they answer; ask for a lower rate, a higher baud "
                 f"rate, or set their Return Delay Time (register {_RETURN_DELAY}) to 0"
             )
 

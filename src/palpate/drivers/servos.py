@@ -12,15 +12,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arm import Arm, Array
+from ..arm import Arm
 from ..errors import DriverError, InputError
 from ..logs import Sample
 from ._port import open_port
-from .bus import Bus, JointMap, Servo
+from .bus import RAD_PER_COUNT, Bus, JointMap, Servo
 from .driver import Driver
 
 _TRIES = 3
 """how often one servo is asked or told outside the control loop"""
+_LATEST_NS = 10_000_000
+"""a servo that answers so much later than the rest is of another moment [ns]: at 10 rad/s^2 it errs by 0.5 mrad"""
 
 
 class Reading(NamedTuple):
@@ -32,6 +34,10 @@ class Reading(NamedTuple):
     """of the horn [rad/s]"""
     current: float
     """[A]"""
+
+    def before(self, duration: float) -> Reading:
+        """Where it was `duration` [s] ago, by its speed."""
+        return self._replace(position=self.position - self.speed * duration / RAD_PER_COUNT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +62,11 @@ class ServoDriver(Driver):
     """An arm of bus servos.
 
     A period is one question to all servos and their answers, in the order of the bus. Answers that are damaged are
-    thrown away and those servos asked once more; unless all have answered within one period, the sample is lost: read()
-    returns None and :attr:`statistics` counts it. A servo that stays silent for `patience` periods in a row is a
+    thrown away and those servos asked once more, their positions taken back to the moment of the rest by their speeds;
+    where one does not answer then, or too late for that, the sample is lost: read() returns None and
+    :attr:`statistics` counts it. A servo that stays silent for `patience` periods in a row is a
     DriverError with its id, and the drives are stopped. The time of a sample is the middle between question and last
-    answer to all. Velocity is in the samples if the arm's card states its deviation for every joint; servos filter it.
+    answer. Velocity is in the samples if the arm's card states its deviation for every joint; servos filter it.
 
     Args:
         arm: the arm.
@@ -137,7 +144,7 @@ class ServoDriver(Driver):
         self._enables = self._sdk.GroupSyncWrite(self._port, self._packets, self._torque_enable, 1)
         self._statistics = BusStatistics()
         self._silent = dict.fromkeys(self._ids, 0)
-        self._start = self._due = time.monotonic_ns()
+        self._start = self._due = self._heard_ns = time.monotonic_ns()
         try:
             self._find_servos()
             self._prepare()
@@ -178,27 +185,26 @@ class ServoDriver(Driver):
 
     def _read(self) -> Sample | None:
         self._wait()
-        begin = time.monotonic_ns()
+        begin, behind = time.monotonic_ns(), 0
         with self._talking():
             self._everybody.txPacket()
             found = self._collect(self._ids)
-            middle = (begin + time.monotonic_ns()) // 2
+            middle = (begin + self._heard_ns) // 2
             again = [i for i in self._ids if i not in found]
             for servo in again:
                 self._packets.readTx(self._port, servo, *self._block)
-                answer = self._collect([servo])
-                if not answer:
+                for reading in self._collect([servo]).values():
+                    behind = self._heard_ns - middle
+                    found[servo] = reading.before(1e-9 * behind)
+                if servo not in found:
                     self._count(unanswered=1)
-                found |= answer
             self._count(periods=1, repeated=len(again))
-        took = time.monotonic_ns() - begin
         for servo in self._ids:
             self._silent[servo] = 0 if servo in found else self._silent[servo] + 1
         dead = [s for s in self._servos if self._silent[s.id] >= self._patience]
         if dead:
             raise DriverError(self._obituary(dead))
-        if len(found) < len(self._ids) or (again and took > self._period_ns):
-            # what was asked again so late is of another moment than the rest
+        if len(found) < len(self._ids) or len(again) == len(self._ids) or behind > _LATEST_NS:
             self._count(lost=1)
             return None
         position, speed, current = np.array([found[i] for i in self._ids]).T
@@ -235,27 +241,26 @@ class ServoDriver(Driver):
             raise DriverError(f"{self._path}: the connection is gone: {_words(error)}") from None
 
     def _collect(self, wanted: Sequence[int]) -> dict[int, Reading]:
-        """The good answers to a question, by id; returns when all are there or time is up."""
+        """The good answers to a question, by id. They come in the order of `wanted`: none follows the last one's."""
         found: dict[int, Reading] = {}
-        for _ in range(2 * len(wanted) + 2):
-            if len(found) == len(wanted):
-                break
+        for _ in wanted:
             packet, result = self._receive()
             if result == self._sdk.COMM_RX_TIMEOUT:
                 break
-            if result != self._sdk.COMM_SUCCESS:
-                self._count(corrupt=1)
-                continue
-            servo, data = packet[self._id_at], packet[self._error_at + 1 :]
-            length = self._length(packet)
-            reading = None
-            if servo in wanted and servo not in found and length == self._block[1] + self._trailer:
-                self._judge(servo, packet[self._error_at])
-                reading = self._decode(servo, bytes(data[: self._block[1]]))
+            servo, reading = -1, None
+            if result == self._sdk.COMM_SUCCESS:
+                servo = packet[self._id_at]
+                if servo in wanted and self._length(packet) == self._block[1] + self._trailer:
+                    first = self._error_at + 1
+                    self._judge(servo, packet[self._error_at])
+                    reading = self._decode(servo, bytes(packet[first : first + self._block[1]]))
             if reading is None:
                 self._count(corrupt=1)
             else:
                 found[servo] = reading
+                self._heard_ns = time.monotonic_ns()
+            if servo == wanted[-1]:
+                break
         return found
 
     def _find_servos(self) -> None:
