@@ -187,6 +187,12 @@ class JointMap:
         """(S,) currents [A] from (S,) torques at the horns [N m]."""
         return torque / self._constants
 
+    def steps(self, current: Array) -> tuple[Array, Array]:
+        """(n,) steps of position [rad] and of torque [N m] of the joints from (S,) steps of current [A]."""
+        return RAD_PER_COUNT * np.abs(self._turn[self.lead]), np.abs(self._torque_per_ampere * current)[
+            self.lead
+        ]
+
     def current_limits(self, arm: Arm) -> Array:
         """(S,) largest currents [A] by the bus file and the torque limits of the joints; may be infinite."""
         torque = np.array([j.limits.effort for j in arm.joints])

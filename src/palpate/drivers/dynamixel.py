@@ -22,6 +22,7 @@ from ..logs import Sample
 from .bus import Bus, Servo
 from .servos import Reading, ServoDriver
 
+_MODEL_NUMBER = 0
 _RETURN_DELAY = 9
 _OPERATING_MODE = 11
 _CURRENT_LIMIT = 38
@@ -124,6 +125,7 @@ class DynamixelDriver(ServoDriver):
     """
 
     _block = _PRESENT
+    _model_number = _MODEL_NUMBER
     _torque_enable = _TORQUE_ENABLE
     _goal = _GOAL_CURRENT
     _id_at, _error_at, _trailer = 4, 8, 2
@@ -153,6 +155,11 @@ class DynamixelDriver(ServoDriver):
         self._limit: Array = np.zeros(count)
         self._watchdog = round(watchdog / _WATCHDOG_UNIT_S)
         self._heard = 0.0
+
+    @property
+    def resolution(self) -> tuple[Array, Array]:
+        """See :attr:`ServoDriver.resolution`."""
+        return self._map.steps(self._unit)
 
     @staticmethod
     def _hint(servo: Servo) -> str:

@@ -21,7 +21,8 @@ from ..errors import DriverError, InputError, MissingExtraError, suggest
 from .bus import COUNTS_PER_TURN, RAD_PER_COUNT, Bus, Servo
 from .servos import Reading, ServoDriver
 
-_MODEL_NUMBER = 777
+_MODEL = 777
+_MODEL_NUMBER = 3
 _RESPONSE_LEVEL = 8
 _PHASE = 18
 _MODE = 33
@@ -116,6 +117,7 @@ class FeetechDriver(ServoDriver):
     """
 
     _block = _PRESENT
+    _model_number = _MODEL_NUMBER
     _torque_enable = _TORQUE_ENABLE
     _goal = _GOAL_PWM
     _id_at, _error_at, _trailer = 2, 4, 1
@@ -145,6 +147,11 @@ class FeetechDriver(ServoDriver):
         """time [s] and position, turns counted, of the last good answer"""
         self._doubted: list[float | None] = [None] * count
 
+    @property
+    def resolution(self) -> tuple[Array, Array]:
+        """See :attr:`ServoDriver.resolution`."""
+        return self._map.steps(np.full(len(self._ids), _CURRENT_UNIT))
+
     @staticmethod
     def _hint(servo: Servo) -> str:
         return "a torque_constant_Nm_A, measured with a known load"
@@ -154,9 +161,9 @@ class FeetechDriver(ServoDriver):
         return packet[3] - 1
 
     def _meet(self, index: int, number: int) -> None:
-        if number != _MODEL_NUMBER:
+        if number != _MODEL:
             raise DriverError(
-                f"{self._who(self._ids[index])} is of model number {number}; an STS3215 says {_MODEL_NUMBER}"
+                f"{self._who(self._ids[index])} is of model number {number}; an STS3215 says {_MODEL}"
             )
 
     def _prepare(self) -> None:

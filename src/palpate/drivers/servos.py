@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arm import Arm
+from ..arm import Arm, Array
 from ..errors import DriverError, InputError
 from ..logs import Sample
 from ._port import open_port
@@ -23,6 +23,10 @@ _TRIES = 3
 """how often one servo is asked or told outside the control loop"""
 _LATEST_NS = 10_000_000
 """a servo that answers so much later than the rest is of another moment [ns]: at 10 rad/s^2 it errs by 0.5 mrad"""
+
+
+class _NoAnswer(DriverError):
+    """A servo does not answer, or not so that it can be understood."""
 
 
 class Reading(NamedTuple):
@@ -82,8 +86,9 @@ class ServoDriver(Driver):
 
     _block: tuple[int, int]
     """address and length [bytes] of what is read in every period"""
+    _model_number: int
     _torque_enable: int
-    """address"""
+    """addresses"""
     _goal: int
     """address of the two bytes that are commanded in every period"""
     _id_at: int
@@ -119,6 +124,7 @@ class ServoDriver(Driver):
         self._packets = sdk.PacketHandler(protocol)
         self._port: Any = None
         self._statistics = BusStatistics()
+        self._timed_out = self._unsettled = False
         self._silent = dict.fromkeys(self._ids, 0)
 
     @property
@@ -130,6 +136,11 @@ class ServoDriver(Driver):
     def bus(self) -> tuple[Servo, ...]:
         """The servos, in the order of the bus file."""
         return self._servos
+
+    @property
+    @abstractmethod
+    def resolution(self) -> tuple[Array, Array]:
+        """Steps of position [rad] and of reported torque [N m] of the joints, (n,) each; once connected."""
 
     # --- the verbs ------------------------------------------------------------------------------------------
 
@@ -184,12 +195,16 @@ class ServoDriver(Driver):
             raise DriverError("; ".join(dict.fromkeys(failed)))
 
     def _read(self) -> Sample | None:
+        if self._unsettled:
+            self._unsettled = False
+            self._settle()
         self._wait()
         begin, behind = time.monotonic_ns(), 0
         with self._talking():
             self._everybody.txPacket()
             found = self._collect(self._ids)
             middle = (begin + self._heard_ns) // 2
+            self._unsettled = self._timed_out
             again = [i for i in self._ids if i not in found]
             for servo in again:
                 self._packets.readTx(self._port, servo, *self._block)
@@ -197,6 +212,7 @@ class ServoDriver(Driver):
                     behind = self._heard_ns - middle
                     found[servo] = reading.before(1e-9 * behind)
                 if servo not in found:
+                    self._unsettled = True
                     self._count(unanswered=1)
             self._count(periods=1, repeated=len(again))
         for servo in self._ids:
@@ -243,9 +259,11 @@ class ServoDriver(Driver):
     def _collect(self, wanted: Sequence[int]) -> dict[int, Reading]:
         """The good answers to a question, by id. They come in the order of `wanted`: none follows the last one's."""
         found: dict[int, Reading] = {}
+        self._timed_out = False
         for _ in wanted:
             packet, result = self._receive()
             if result == self._sdk.COMM_RX_TIMEOUT:
+                self._timed_out = True
                 break
             servo, reading = -1, None
             if result == self._sdk.COMM_SUCCESS:
@@ -263,20 +281,23 @@ class ServoDriver(Driver):
                 break
         return found
 
+    def _settle(self) -> None:
+        """Let answers that are late come, and throw them away: they must not pass for answers to the next question."""
+        with self._talking():
+            time.sleep(1e-3 * self._port.grace_ms)
+            self._port.clearPort()
+
     def _find_servos(self) -> None:
         """Every servo is there and is of a known model."""
         missing, there = [], []
         for i, servo in enumerate(self._servos):
-            for _ in range(_TRIES):
-                with self._talking():
-                    number, result, error = self._packets.ping(self._port, servo.id)
-                if result == self._sdk.COMM_SUCCESS:
-                    self._judge(servo.id, error)
-                    self._meet(i, number)
-                    there.append(servo.id)
-                    break
-            else:
+            try:
+                number = self._ask(servo.id, self._model_number, 2)
+            except _NoAnswer:
                 missing.append(servo)
+            else:
+                self._meet(i, number)
+                there.append(servo.id)
         if missing:
             raise DriverError(
                 f"{self._path}: {_names(missing)} {'does' if len(missing) == 1 else 'do'} not answer at {self._baud} "
@@ -292,7 +313,7 @@ class ServoDriver(Driver):
         """One register, little-endian.
 
         Raises:
-            DriverError: no good answer.
+            DriverError: no good answer, or the servo is not well.
         """
         why = ""
         for _ in range(_TRIES):
@@ -302,7 +323,8 @@ class ServoDriver(Driver):
                 self._judge(servo, error)
                 return int.from_bytes(bytes(data), "little")
             why = self._packets.getTxRxResult(result)
-        raise DriverError(f"servo {servo}: register {address} cannot be read: {why}")
+            self._settle()
+        raise _NoAnswer(f"{self._who(servo)}: register {address} cannot be read: {why}")
 
     def _tell(self, servo: int, address: int, size: int, value: int) -> None:
         """Write one register and wait until the servo confirms it.
@@ -320,7 +342,8 @@ class ServoDriver(Driver):
                 self._check_refusal(servo, address, value, error)
                 return
             why = self._packets.getTxRxResult(result)
-        raise DriverError(f"servo {servo}: register {address} cannot be written: {why}")
+            self._settle()
+        raise _NoAnswer(f"{self._who(servo)}: register {address} cannot be written: {why}")
 
     def _send(self, group: Any, values: Sequence[tuple[int, ...]]) -> None:
         """Bytes to all servos at once; none of them answers."""
