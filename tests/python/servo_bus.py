@@ -42,16 +42,17 @@ class Emulated:
 
 
 class World:
-    """The joints: at rest where they are put, or moved by a plant in real time."""
+    """The joints: at rest where they are put, or moved by a plant in real time; held by hand until a drive is on."""
 
     def __init__(self, n: int, plant=None) -> None:
         self.plant = plant
         self.q, self.dq, self.torque = np.zeros(n), np.zeros(n), np.zeros(n)
+        self.held = True
         self._last = time.monotonic_ns()
 
     def advance(self) -> None:
         now = time.monotonic_ns()
-        if self.plant is not None and now > self._last:
+        if self.plant is not None and not self.held and now > self._last:
             self.plant.step(self.torque, now - self._last)
             self.q, self.dq = self.plant.q, self.plant.dq
         self._last = now
@@ -65,6 +66,7 @@ class ServoBus:
     """
 
     header = b""
+    ENABLE = 0
 
     def __init__(
         self,
@@ -127,6 +129,7 @@ class ServoBus:
         heard = b""
         while not self._stop:
             if not select.select([self._master], [], [], 0.02)[0]:
+                self.world.advance()
                 continue
             heard += os.read(self._master, 4096)
             began = time.monotonic()
@@ -207,6 +210,7 @@ class ServoBus:
         for servo in self.servos.values():
             torque[servo.joint] += servo.direction * servo.gear * self.horn_torque(servo)
         self.world.torque = torque
+        self.world.held &= not any(t[self.ENABLE] for t in self.tables.values())
 
     @abstractmethod
     def table(self, servo: Emulated) -> bytearray: ...

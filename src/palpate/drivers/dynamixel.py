@@ -211,7 +211,6 @@ class DynamixelDriver(ServoDriver):
     def _judge(self, servo: int, error: int) -> None:
         if not error & _ALERT:
             return
-        # asking leads back here: the answer carries the same alert
         with self._talking():
             bits, result, _ = self._packets.read1ByteTxRx(self._port, servo, _HARDWARE_ERROR)
         words = [word for bit, word in _HARDWARE.items() if bits & bit]

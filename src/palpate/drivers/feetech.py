@@ -28,12 +28,15 @@ _PHASE = 18
 _MODE = 33
 _TORQUE_ENABLE = 40
 _GOAL_PWM = 44
+_STATUS = 65
 _PRESENT = (56, 15)
 """position (2), speed (2), load (2), voltage, temperature, -, status, moving, goal (2), current (2)"""
 _PWM_MODE = 2
 _PHASE_COARSE_SPEED, _PHASE_MULTI_TURN = 0x04, 0x10
 _CURRENT_UNIT = 6.5e-3
 """[A]"""
+_MOST_CURRENT = 2047
+"""largest that can be set as a limit [6.5 mA]"""
 _FULL = 1000
 """of load and PWM"""
 _FASTEST = 3.0 * COUNTS_PER_TURN
@@ -94,6 +97,16 @@ class Feedback:
             temperature=block[7],
             status=block[9],
             current=signed(word[13], 15),
+        )
+
+    def plausible(self) -> bool:
+        """Whether a servo can mean this; the sum that protects an answer lets one damaged answer in 256 through."""
+        return (
+            abs(self.load) <= _FULL
+            and abs(self.speed) <= _FASTEST
+            and abs(self.current) <= _MOST_CURRENT
+            and 3.0 <= self.voltage <= 20.0
+            and self.temperature <= 125
         )
 
 
@@ -180,9 +193,10 @@ class FeetechDriver(ServoDriver):
     def _decode(self, servo: int, data: bytes) -> Reading | None:
         seen = Feedback.of(data)
         i = self._ids.index(servo)
-        self._judge(servo, seen.status)
-        if abs(seen.load) > _FULL or not 3.0 <= seen.voltage <= 20.0:
+        if not seen.plausible():
             return None
+        if seen.status:
+            self._complaints[servo] = seen.status
         position = self._count_turns(i, seen.position)
         if position is None:
             return None
@@ -208,8 +222,13 @@ class FeetechDriver(ServoDriver):
         return found
 
     def _judge(self, servo: int, error: int) -> None:
-        words = [word for bit, word in _WELL.items() if error & bit]
-        if words:
+        """One damaged answer in 256 looks good: an error counts if the servo says so again."""
+        if not error:
+            return
+        with self._talking():
+            status, result, _ = self._packets.read1ByteTxRx(self._port, servo, _STATUS)
+        words = [word for bit, word in _WELL.items() if error & status & bit]
+        if result == self._sdk.COMM_SUCCESS and words:
             raise DriverError(f"{self._who(servo)} reports an error: {', '.join(words)}")
 
     def _check_refusal(self, servo: int, address: int, value: int, error: int) -> None:

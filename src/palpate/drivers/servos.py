@@ -19,7 +19,7 @@ from ._port import open_port
 from .bus import RAD_PER_COUNT, Bus, JointMap, Servo
 from .driver import Driver
 
-_TRIES = 3
+_TRIES = 5
 """how often one servo is asked or told outside the control loop"""
 _LATEST_NS = 10_000_000
 """a servo that answers so much later than the rest is of another moment [ns]: at 10 rad/s^2 it errs by 0.5 mrad"""
@@ -125,6 +125,7 @@ class ServoDriver(Driver):
         self._port: Any = None
         self._statistics = BusStatistics()
         self._timed_out = self._unsettled = False
+        self._complaints: dict[int, int] = {}
         self._silent = dict.fromkeys(self._ids, 0)
 
     @property
@@ -205,12 +206,14 @@ class ServoDriver(Driver):
             found = self._collect(self._ids)
             middle = (begin + self._heard_ns) // 2
             self._unsettled = self._timed_out
+            self._hear_complaints(found)
             again = [i for i in self._ids if i not in found]
             for servo in again:
                 self._packets.readTx(self._port, servo, *self._block)
                 for reading in self._collect([servo]).values():
                     behind = self._heard_ns - middle
                     found[servo] = reading.before(1e-9 * behind)
+                self._hear_complaints(found)
                 if servo not in found:
                     self._unsettled = True
                     self._count(unanswered=1)
@@ -270,16 +273,25 @@ class ServoDriver(Driver):
                 servo = packet[self._id_at]
                 if servo in wanted and self._length(packet) == self._block[1] + self._trailer:
                     first = self._error_at + 1
-                    self._judge(servo, packet[self._error_at])
                     reading = self._decode(servo, bytes(packet[first : first + self._block[1]]))
             if reading is None:
                 self._count(corrupt=1)
             else:
                 found[servo] = reading
+                if packet[self._error_at]:
+                    self._complaints[servo] = packet[self._error_at]
                 self._heard_ns = time.monotonic_ns()
             if servo == wanted[-1]:
                 break
         return found
+
+    def _hear_complaints(self, found: dict[int, Reading]) -> None:
+        """Raise if a servo is not well; answers that only seem to say so are taken out of `found`."""
+        while self._complaints:
+            servo, error = self._complaints.popitem()
+            self._judge(servo, error)
+            self._count(corrupt=1)
+            found.pop(servo, None)
 
     def _settle(self) -> None:
         """Let answers that are late come, and throw them away: they must not pass for answers to the next question."""
@@ -390,7 +402,7 @@ class ServoDriver(Driver):
 
     @abstractmethod
     def _judge(self, servo: int, error: int) -> None:
-        """Raise DriverError if the error of an answer says that the servo is not well."""
+        """Raise DriverError if the servo is not well, as an error in an answer says; asks it if that is in doubt."""
 
     @abstractmethod
     def _check_refusal(self, servo: int, address: int, value: int, error: int) -> None:
