@@ -431,9 +431,12 @@ def main(text: str) -> None:
     bus.world.q = plant.q
     with bus:
         print(bus.port, flush=True)
-        sys.stdin.read()
         if options.get("die"):
+            while bus.world.held:
+                time.sleep(0.01)
+            time.sleep(options["die_after"])
             bus.dead.add(options["die"])
+        sys.stdin.read()
     said = {"questions": bus.questions, "damaged": bus.damaged, "dropped": bus.dropped}
     on = [i for i, t in bus.tables.items() if t[bus.ENABLE]]
     print(json.dumps({**said, "on": on, "q": bus.world.q.tolist()}), flush=True)

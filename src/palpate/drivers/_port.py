@@ -13,6 +13,8 @@ from ..errors import DriverError
 
 GRACE_MS = 10.0
 """how long an answer may take beyond its time on the wire [ms]: the servo's own delay, USB, this computer"""
+GAP_MS = 2.0
+"""the same from one answer to the next [ms]"""
 _WRITE_S = 0.2
 _logger = logging.getLogger(__name__)
 
@@ -44,6 +46,11 @@ def open_port(handler: type, path: str, baud: int) -> Any:
             self.packet_start_time = self.getCurrentTime()
             self.packet_timeout = self.tx_time_per_byte * packet_length + self.grace_ms
 
+        def expect(self, length: int) -> None:
+            """Answers have begun to come: the rest, of so many bytes, follows at once."""
+            self.packet_start_time = self.getCurrentTime()
+            self.packet_timeout = self.tx_time_per_byte * length + self.gap_ms
+
         def getCurrentTime(self) -> float:
             return time.monotonic() * 1e3
 
@@ -62,6 +69,7 @@ def open_port(handler: type, path: str, baud: int) -> Any:
         )
     port = Port(path)
     port.grace_ms = GRACE_MS + 2.0 * latency
+    port.gap_ms = GAP_MS + 2.0 * latency
     try:
         if not port.setBaudRate(baud):
             raise DriverError(f"{path}: {baud} bit/s is not a speed of these servos")

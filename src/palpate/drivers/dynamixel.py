@@ -68,19 +68,21 @@ class Model:
     current_unit: float | None
     """of goal and present current [A]; None: it measures load, not current"""
     stall: float | None = None
-    """stall torque / stall current that the e-Manual states at 12 V (24 V for V, 5 V for 330) [N m/A]: a first guess at
+    """stall torque / stall current that the e-Manual states at 12 V (24 V for V) [N m/A]: a first guess at
     the torque constant, friction and the offset of the current not taken into account"""
+    supply: bool = False
+    """the current is that of the servo's supply, not of its motor: it is no measure of torque"""
 
 
 _X, _V, _330, _MX = 2.69e-3, 1.34e-3, 1.0e-3, 3.36e-3
 MODELS = MappingProxyType(
     {
-        "XL330-M077": Model(1190, _330, 0.215 / 1.47),
-        "XL330-M288": Model(1200, _330, 0.52 / 1.47),
-        "XC330-T181": Model(1210, _330),
-        "XC330-T288": Model(1220, _330),
-        "XC330-M181": Model(1230, _330, 0.60 / 1.80),
-        "XC330-M288": Model(1240, _330),
+        "XL330-M077": Model(1190, _330, supply=True),
+        "XL330-M288": Model(1200, _330, supply=True),
+        "XC330-T181": Model(1210, _330, supply=True),
+        "XC330-T288": Model(1220, _330, supply=True),
+        "XC330-M181": Model(1230, _330, supply=True),
+        "XC330-M288": Model(1240, _330, supply=True),
         "XM430-W210": Model(1030, _X, 3.0 / 2.3),
         "XM430-W350": Model(1020, _X, 4.1 / 2.3),
         "XM540-W150": Model(1130, _X, 7.3 / 4.4),
@@ -183,6 +185,11 @@ class DynamixelDriver(ServoDriver):
         if servo.model is not None and servo.model != name:
             raise DriverError(f"{who} is a {name}; the bus file says {servo.model}")
         self._unit[index] = _known(name, who, DriverError)
+        if MODELS[name].supply:
+            self._doubts[servo.id] = (
+                f"{who}, a {name}, reports the current of its supply, not of its motor: it is no measure of torque; "
+                "record it and see palpate.identify.servo"
+            )
 
     def _prepare(self) -> None:
         count, delay = len(self._ids), 0.0
@@ -196,6 +203,7 @@ class DynamixelDriver(ServoDriver):
                 )
             delay += _DELAY_UNIT_S * self._ask(servo, _RETURN_DELAY, 1)
         self._port.grace_ms += 1e3 * delay
+        self._port.gap_ms += 1e3 * delay
         wire = 10.0 / self._baud * ((14 + count) + count * (11 + _PRESENT[1]) + (14 + 3 * count))
         if wire + delay > 1e-9 * self._period_ns:
             raise DriverError(

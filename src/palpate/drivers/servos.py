@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import termios
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -126,7 +127,9 @@ class ServoDriver(Driver):
         self._statistics = BusStatistics()
         self._timed_out = self._unsettled = False
         self._complaints: dict[int, int] = {}
+        self._doubts = {}
         self._silent = dict.fromkeys(self._ids, 0)
+        self._doubts: dict[int, str] = {}
 
     @property
     def statistics(self) -> BusStatistics:
@@ -139,6 +142,11 @@ class ServoDriver(Driver):
         return self._servos
 
     @property
+    def doubts(self) -> tuple[str, ...]:
+        """Why the effort of this arm is not its torque, one sentence per servo; empty: it is. Once connected."""
+        return tuple(self._doubts.values())
+
+    @property
     @abstractmethod
     def resolution(self) -> tuple[Array, Array]:
         """Steps of position [rad] and of reported torque [N m] of the joints, (n,) each; once connected."""
@@ -149,6 +157,7 @@ class ServoDriver(Driver):
         self._port = open_port(self._sdk.PortHandler, self._path, self._baud)
         self._receive = _receiver(self._packets, self._port)
         address, length = self._block
+        self._answer_length = self._error_at + 1 + length + self._trailer
         self._everybody = self._sdk.GroupSyncRead(self._port, self._packets, address, length)
         for servo in self._ids:
             self._everybody.addParam(servo)
@@ -172,7 +181,7 @@ class ServoDriver(Driver):
             return
         try:
             port.closePort()
-        except OSError as error:
+        except (OSError, termios.error) as error:
             raise DriverError(f"{self._path}: cannot be closed: {_words(error)}") from None
 
     def _enable(self) -> None:
@@ -256,18 +265,19 @@ class ServoDriver(Driver):
         self._port.is_using = False
         try:
             yield
-        except OSError as error:
+        except (OSError, termios.error) as error:
             raise DriverError(f"{self._path}: the connection is gone: {_words(error)}") from None
 
     def _collect(self, wanted: Sequence[int]) -> dict[int, Reading]:
         """The good answers to a question, by id. They come in the order of `wanted`: none follows the last one's."""
         found: dict[int, Reading] = {}
         self._timed_out = False
-        for _ in wanted:
+        for left in range(len(wanted) - 1, -1, -1):
             packet, result = self._receive()
             if result == self._sdk.COMM_RX_TIMEOUT:
                 self._timed_out = True
                 break
+            self._port.expect(left * self._answer_length)
             servo, reading = -1, None
             if result == self._sdk.COMM_SUCCESS:
                 servo = packet[self._id_at]

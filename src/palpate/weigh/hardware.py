@@ -13,7 +13,13 @@ _PERIODS = 50
 
 
 def driven_arm(arm: Arm, driver: ServoDriver) -> Arm:
-    """The arm with the effort that its driver reports, and with the steps of its servos where the card names none."""
+    """The arm with the effort that its driver reports, and with the steps of its servos where the card names none.
+
+    Raises:
+        InputError: what the servos report is not their torque.
+    """
+    if driver.doubts:
+        raise InputError(f"this arm cannot be weighed with live: {driver.doubts[0]}")
     position, torque = driver.resolution
     joints = []
     for joint, count, step in zip(arm.joints, position, torque, strict=True):
