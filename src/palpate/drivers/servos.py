@@ -124,12 +124,17 @@ class ServoDriver(Driver):
         self._sdk = sdk
         self._packets = sdk.PacketHandler(protocol)
         self._port: Any = None
-        self._statistics = BusStatistics()
-        self._timed_out = self._unsettled = False
-        self._complaints: dict[int, int] = {}
-        self._doubts = {}
-        self._silent = dict.fromkeys(self._ids, 0)
         self._doubts: dict[int, str] = {}
+        self._complaints: dict[int, int] = {}
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin as if nothing had happened on the bus."""
+        self._statistics = BusStatistics()
+        self._silent = dict.fromkeys(self._ids, 0)
+        self._timed_out = self._unsettled = False
+        self._complaints.clear()
+        self._doubts.clear()
 
     @property
     def statistics(self) -> BusStatistics:
@@ -163,8 +168,7 @@ class ServoDriver(Driver):
             self._everybody.addParam(servo)
         self._goals = self._sdk.GroupSyncWrite(self._port, self._packets, self._goal, 2)
         self._enables = self._sdk.GroupSyncWrite(self._port, self._packets, self._torque_enable, 1)
-        self._statistics = BusStatistics()
-        self._silent = dict.fromkeys(self._ids, 0)
+        self._forget()
         self._start = self._due = self._heard_ns = time.monotonic_ns()
         try:
             self._find_servos()
