@@ -19,6 +19,7 @@ import time
 import tty
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -48,10 +49,14 @@ class World:
         self.plant = plant
         self.q, self.dq, self.torque = np.zeros(n), np.zeros(n), np.zeros(n)
         self.held = True
+        self.speed = 0.0
+        """of all joints, without a plant [rad/s]"""
         self._last = time.monotonic_ns()
 
     def advance(self) -> None:
         now = time.monotonic_ns()
+        if self.speed:
+            self.q = self.q + 1e-9 * (now - self._last) * self.speed
         if self.plant is not None and not self.held and now > self._last:
             self.plant.step(self.torque, now - self._last)
             self.q, self.dq = self.plant.q, self.plant.dq
@@ -230,6 +235,8 @@ class DynamixelBus(ServoBus):
     """Protocol 2.0, X series."""
 
     header = b"\xff\xff\xfd\x00"
+    turns: ClassVar[dict[int, int]] = {}
+    """by how many turns a servo counts otherwise while it is not in current control"""
     RDT, MODE, LIMIT, ENABLE, HARDWARE, WATCHDOG, GOAL = 9, 11, 38, 64, 70, 98, 102
 
     @staticmethod
@@ -327,6 +334,8 @@ class DynamixelBus(ServoBus):
     def look(self, servo: int, address: int, length: int) -> bytes:
         t, emulated = self.tables[servo], self.servos[servo]
         position, speed = self.horn(emulated)
+        if t[self.MODE] != 0:
+            position += 4096 * self.turns.get(servo, 0)
         now = (self.current(emulated), round(speed / TURN * 60.0 / 0.229), position)
         struct.pack_into("<hii", t, 126, *now)
         if address == 126:

@@ -19,7 +19,7 @@ import numpy as np
 from ..arm import Arm, Array
 from ..errors import DriverError, InputError, MissingExtraError, suggest
 from ..logs import Sample
-from .bus import Bus, Servo
+from .bus import COUNTS_PER_TURN, Bus, Servo
 from .servos import Reading, ServoDriver
 
 _MODEL_NUMBER = 0
@@ -32,6 +32,7 @@ _WATCHDOG = 98
 _GOAL_CURRENT = 102
 _PRESENT = (126, 10)
 """current (2 bytes), velocity (4), position (4)"""
+_POSITION = (132, 4)
 _CURRENT_CONTROL = 0
 _WATCHDOG_UNIT_S = 0.02
 _DELAY_UNIT_S = 2e-6
@@ -71,7 +72,8 @@ class Model:
     """stall torque / stall current that the e-Manual states at 12 V (24 V for V) [N m/A]: a first guess at
     the torque constant, friction and the offset of the current not taken into account"""
     supply: bool = False
-    """the current is that of the servo's supply, not of its motor: it is no measure of torque"""
+    """the current is that of the servo's supply, not of its motor: it is no measure of torque. Seen in recordings of
+    XL330; the other servos of that size are taken to be alike"""
 
 
 _X, _V, _330, _MX = 2.69e-3, 1.34e-3, 1.0e-3, 3.36e-3
@@ -235,14 +237,21 @@ class DynamixelDriver(ServoDriver):
                 f"{self._who(servo)} refuses {value} in register {address}: "
                 f"{_REFUSALS.get(refusal, f'error {refusal}')}"
             )
-        if address != _TORQUE_ENABLE or value:  # switching off must work in any state
+        if address != _TORQUE_ENABLE or value:
             self._judge(servo, error)
 
     def _switch_on(self, index: int) -> None:
         servo = self._ids[index]
         self._tell(servo, _WATCHDOG, 1, 0)  # a watchdog that has struck lets nothing be commanded
         if self._ask(servo, _OPERATING_MODE, 1) != _CURRENT_CONTROL:
+            before = self._ask(servo, *_POSITION)
             self._tell(servo, _OPERATING_MODE, 1, _CURRENT_CONTROL)
+            turns = (self._ask(servo, *_POSITION) - before + 2**31) % 2**32 - 2**31
+            if abs(turns) > COUNTS_PER_TURN // 2:
+                raise DriverError(
+                    f"{self._who(servo)} counts other turns in current control: its position went by {turns} counts; "
+                    "it is in current control now, so begin again, and check where the joint reads"
+                )
         self._tell(servo, _GOAL_CURRENT, 2, 0)
         self._tell(servo, _TORQUE_ENABLE, 1, 1)
         self._tell(servo, _WATCHDOG, 1, self._watchdog)
@@ -260,9 +269,6 @@ class DynamixelDriver(ServoDriver):
                 f"{1e3 * (now - self._heard):.0f} ms without a packet: the watchdogs have stopped the servos"
             )
         self._heard = now
-
-    def _switch_off(self, servo: Servo) -> None:
-        self._tell(servo.id, _TORQUE_ENABLE, 1, 0)
 
     def _write(self, torque: Array) -> Array:
         self._check_watchdog()

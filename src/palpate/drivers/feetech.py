@@ -232,7 +232,7 @@ class FeetechDriver(ServoDriver):
             raise DriverError(f"{self._who(servo)} reports an error: {', '.join(words)}")
 
     def _check_refusal(self, servo: int, address: int, value: int, error: int) -> None:
-        if address != _TORQUE_ENABLE or value:  # switching off must work in any state
+        if address != _TORQUE_ENABLE or value:
             self._judge(servo, error)
 
     def _switch_on(self, index: int) -> None:
@@ -240,9 +240,6 @@ class FeetechDriver(ServoDriver):
         self._tell(servo, _MODE, 1, _PWM_MODE)
         self._tell(servo, _GOAL_PWM, 2, 0)
         self._tell(servo, _TORQUE_ENABLE, 1, 1)
-
-    def _switch_off(self, servo: Servo) -> None:
-        self._tell(servo.id, _TORQUE_ENABLE, 1, 0)
 
     def _write(self, torque: Array) -> Array:
         currents = np.clip(self._map.currents(torque), -self._bus_limits, self._bus_limits)

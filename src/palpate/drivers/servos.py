@@ -22,6 +22,8 @@ from .driver import Driver
 
 _TRIES = 5
 """how often one servo is asked or told outside the control loop"""
+_ROUNDS = 3
+"""how often all are told to switch off, as long as one has not confirmed it"""
 _LATEST_NS = 10_000_000
 """a servo that answers so much later than the rest is of another moment [ns]: at 10 rad/s^2 it errs by 0.5 mrad"""
 
@@ -193,20 +195,26 @@ class ServoDriver(Driver):
             self._switch_on(i)
 
     def _disable(self) -> None:
-        """Goal zero and torque off, to all at once without waiting for answers; then to each until it confirms."""
-        failed = []
-        try:
-            self._send(self._goals, [(0, 0)] * len(self._ids))
-            self._send(self._enables, [(0,)] * len(self._ids))
-        except DriverError as error:
-            failed.append(str(error))
-        for servo in self._servos:
+        """Goal zero and torque off: to all at once, then to each until it confirms; a dead one holds up nobody."""
+        on, failed = list(self._servos), list[str]()
+        for _ in range(_ROUNDS):
+            failed.clear()
             try:
-                self._switch_off(servo)
+                self._send(self._goals, [(0, 0)] * len(self._ids))
+                self._send(self._enables, [(0,)] * len(self._ids))
             except DriverError as error:
                 failed.append(str(error))
-        if failed:
-            raise DriverError("; ".join(dict.fromkeys(failed)))
+            asked, on = on, []
+            for servo in asked:
+                try:
+                    # switching off must work in any state: what the servo complains of does not matter
+                    self._tell(servo.id, self._torque_enable, 1, 0, tries=1)
+                except DriverError as error:
+                    on.append(servo)
+                    failed.append(str(error))
+            if not on:
+                return
+        raise DriverError("; ".join(dict.fromkeys(failed)))
 
     def _read(self) -> Sample | None:
         if self._unsettled:
@@ -352,14 +360,14 @@ class ServoDriver(Driver):
             self._settle()
         raise _NoAnswer(f"{self._who(servo)}: register {address} cannot be read: {why}")
 
-    def _tell(self, servo: int, address: int, size: int, value: int) -> None:
+    def _tell(self, servo: int, address: int, size: int, value: int, *, tries: int = _TRIES) -> None:
         """Write one register and wait until the servo confirms it.
 
         Raises:
             DriverError: no confirmation, or a refusal.
         """
         why = ""
-        for _ in range(_TRIES):
+        for _ in range(tries):
             with self._talking():
                 result, error = self._packets.writeTxRx(
                     self._port, servo, address, size, list(value.to_bytes(size, "little"))
@@ -425,10 +433,6 @@ class ServoDriver(Driver):
     @abstractmethod
     def _switch_on(self, index: int) -> None:
         """Torque on, at the safe command."""
-
-    @abstractmethod
-    def _switch_off(self, servo: Servo) -> None:
-        """Torque off, confirmed."""
 
 
 def _receiver(packets: Any, port: Any) -> Callable[[], tuple[list[int], int]]:
