@@ -606,6 +606,31 @@ def test_damaged_answers_never_make_a_wrong_number(make: str) -> None:
     assert seen > 200
 
 
+def test_what_a_one_byte_sum_lets_through_is_mostly_impossible() -> None:
+    """The driver's own checks, without the line: position, values and errors of answers whose sum is right by chance."""
+    emulator = FeetechBus([Emulated(id=3, joint=0, model=777)], corrupt=1.0, seed=0)
+    table = emulator.tables[3]
+    table[emulator.ENABLE], table[emulator.MODE], table[emulator.PWM] = 1, 2, 200
+    good = emulator.status(3, emulator.look(3, 56, 15))
+    truth = Feedback.of(good[5:20])
+    right_sum = passed = 0
+    for _ in range(60_000):
+        bad = emulator._spoil(good)[: len(good)]
+        if len(bad) < len(good) or bad[:5] != good[:5] or ~sum(bad[2:-1]) & 0xFF != bad[-1]:
+            continue
+        seen = Feedback.of(bad[5:20])
+        right_sum += seen != truth
+        passed += (
+            seen != truth
+            and seen.plausible()
+            and not seen.status
+            and abs(seen.position - truth.position) <= 12_288 * 4e-3 + 8
+        )
+    emulator.unplug()
+    assert right_sum > 50
+    assert passed <= 0.25 * right_sum and passed <= 60_000 / 2_000
+
+
 @pytest.mark.parametrize("make", MAKES)
 def test_one_percent_damaged_loses_at_most_one_percent(make: str) -> None:
     with bus(make, corrupt=0.01, seed=2) as emulator, driver(make, emulator.port, rate=200.0) as arm_on_bus:
