@@ -607,7 +607,7 @@ def test_damaged_answers_never_make_a_wrong_number(make: str) -> None:
 
 
 def test_what_a_one_byte_sum_lets_through_is_mostly_impossible() -> None:
-    """The driver's own checks, without the line: position, values and errors of answers whose sum is right by chance."""
+    """Without the line: what the driver itself checks of answers whose sum is right by chance."""
     emulator = FeetechBus([Emulated(id=3, joint=0, model=777)], corrupt=1.0, seed=0)
     table = emulator.tables[3]
     table[emulator.ENABLE], table[emulator.MODE], table[emulator.PWM] = 1, 2, 200

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 PROGRESS_S = 0.1
 """time between two calls of progress [s], simulated"""
+_PATIENCE_S = 1.0
+"""how long a real arm goes on at the end where samples have just been lost [s]"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -419,7 +421,7 @@ def run(
                 if frames is not None and plant is not None and time >= next_frame:
                     next_frame += 1.0 / frame_rate
                     frames(plant.render())
-                if not task.simulated and time >= task.duration:
+                if not task.simulated and _over(task, time, touch):
                     break
             if recorder is not None and interrupted and last_ns is not None:
                 recorder.event(last_ns, "stop", "stopped before its end, by request")
@@ -434,6 +436,12 @@ def run(
         if recorder is not None:
             recorder.close()
     return rows.session(task, pipeline, interrupted, drawn, error)
+
+
+def _over(task: Task, time: float, touch: Touch) -> bool:
+    """Whether a real arm may stop: not just behind samples that were lost, if it can be helped."""
+    late = time - task.duration
+    return late >= 0.0 and (Status(touch.payload.status) != Status.gap or late >= _PATIENCE_S)
 
 
 def _truth(plant: Plant) -> tuple[Array, Array, float]:
