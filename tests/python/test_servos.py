@@ -816,22 +816,27 @@ def weigh(make: str, process: Process, folder: Path, *more: object) -> int:
 def test_weighs_over_the_bus(
     make: str, line: dict, tmp_path: Path, capsys: pytest.CaptureFixture[str], record_property
 ) -> None:
-    process = Process(make, tmp_path, bus={"baud": 1e6, "usb": 5e-4, "noise_counts": 2, **line})
-    code = weigh(make, process, tmp_path, "--duration", 5, "--json", "--no-report")
-    told = process.end()
-    captured = capsys.readouterr()
-    assert code == 0, captured.err
-    found = json.loads(captured.out)
+    """In real time, which a busy machine cannot always keep: then the number may be refused, but never wrong."""
+    for _ in range(3):
+        process = Process(make, tmp_path, bus={"baud": 1e6, "usb": 5e-4, "noise_counts": 2, **line})
+        code = weigh(make, process, tmp_path, "--duration", 5, "--json", "--no-report")
+        told = process.end()
+        captured = capsys.readouterr()
+        assert code == 0, captured.err
+        found = json.loads(captured.out)
+        assert found["truth_kg"] is None and found["seed"] is None
+        assert found["goal_error_rad"] < 0.05
+        assert told["on"] == []
+        if line:
+            assert found["bus"]["corrupt"] > 0 and told["damaged"] > 10
+        if found["status"] == "ok":
+            break
+        assert found["bus"]["late"] > 0.02 * found["bus"]["periods"], found
     for key in ("rate_hz", "lost", "late"):  # of this machine, as busy as it is: told, not judged
         record_property(f"{make}_{key}", found["bus"][key])
         print(make, line, key, found["bus"][key])
     assert found["status"] == "ok"
     assert abs(found["mass_kg"] - 0.25) < 0.02 * 0.25
-    assert found["truth_kg"] is None and found["seed"] is None
-    assert found["goal_error_rad"] < 0.05
-    assert told["on"] == []
-    if line:
-        assert found["bus"]["corrupt"] > 0 and told["damaged"] > 10
     assert main(["replay", str(tmp_path / "run.mcap"), "--quiet"]) == 0
 
 
