@@ -463,6 +463,8 @@ def test_a_driven_arm_knows_its_servos_steps(make: str) -> None:
     assert arm.effort == arm_on_bus.effort
     assert math.isclose(arm.joints[0].sensing.position_resolution, TURN / 4096)
     assert math.isclose(arm.joints[0].sensing.torque_resolution, 1.783 * step)
+    coarse = ARM.replace(joints=tuple(j.replace(sensing=Sensing(0.1, 0.2, None, 1.0)) for j in ARM.joints))
+    assert W.driven_arm(coarse, arm_on_bus).joints[0].sensing == Sensing(0.1, 0.2, None, 1.0)
 
 
 @pytest.mark.parametrize("make", MAKES)
@@ -816,12 +818,15 @@ def weigh(make: str, process: Process, folder: Path, *more: object) -> int:
 def test_weighs_over_the_bus(
     make: str, line: dict, tmp_path: Path, capsys: pytest.CaptureFixture[str], record_property
 ) -> None:
-    """In real time, which a busy machine cannot always keep: then the number may be refused, but never wrong."""
-    for _ in range(3):
+    """In real time, which a busy machine cannot always keep: then the number may be refused or vague, never wrong."""
+    for _ in range(4):
         process = Process(make, tmp_path, bus={"baud": 1e6, "usb": 5e-4, "noise_counts": 2, **line})
         code = weigh(make, process, tmp_path, "--duration", 5, "--json", "--no-report")
         told = process.end()
         captured = capsys.readouterr()
+        if code == 2:  # the emulated arm got no processor for so long that it seemed dead
+            assert "no servo answers" in captured.err or "watchdog" in captured.err
+            continue
         assert code == 0, captured.err
         found = json.loads(captured.out)
         assert found["truth_kg"] is None and found["seed"] is None
@@ -829,13 +834,16 @@ def test_weighs_over_the_bus(
         assert told["on"] == []
         if line:
             assert found["bus"]["corrupt"] > 0 and told["damaged"] > 10
-        if found["status"] == "ok":
+        good = found["status"] == "ok"
+        assert not good or abs(found["mass_kg"] - 0.25) < 5.0 * found["mass_std_kg"]
+        if good and found["mass_std_kg"] < 0.002:
             break
         assert found["bus"]["late"] > 0.02 * found["bus"]["periods"], found
+    else:
+        pytest.fail("in no run this machine kept the time of the loop")
     for key in ("rate_hz", "lost", "late"):  # of this machine, as busy as it is: told, not judged
         record_property(f"{make}_{key}", found["bus"][key])
         print(make, line, key, found["bus"][key])
-    assert found["status"] == "ok"
     assert abs(found["mass_kg"] - 0.25) < 0.02 * 0.25
     assert main(["replay", str(tmp_path / "run.mcap"), "--quiet"]) == 0
 

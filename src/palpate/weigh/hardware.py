@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..arm import Arm, Array, Sensing
@@ -13,7 +15,7 @@ _PERIODS = 50
 
 
 def driven_arm(arm: Arm, driver: ServoDriver) -> Arm:
-    """The arm with the effort that its driver reports, and with the steps of its servos where the card names none.
+    """The arm with the effort that its driver reports, and its servos' steps where the card names finer ones or none.
 
     Raises:
         InputError: what the servos report is not their torque.
@@ -23,9 +25,14 @@ def driven_arm(arm: Arm, driver: ServoDriver) -> Arm:
     position, torque = driver.resolution
     joints = []
     for joint, count, step in zip(arm.joints, position, torque, strict=True):
-        if joint.sensing == Sensing():
-            joint = joint.replace(sensing=Sensing(float(count), float(count), None, float(step)))
-        joints.append(joint)
+        known = joint.sensing
+        sensing = replace(
+            known,
+            position_resolution=max(known.position_resolution, float(count)),
+            position_std=float(count) if known == Sensing() else known.position_std,
+            torque_resolution=max(known.torque_resolution, float(step)),
+        )
+        joints.append(joint.replace(sensing=sensing))
     return arm.replace(joints=tuple(joints), effort=driver.effort)
 
 
