@@ -12,12 +12,12 @@ import re
 from collections.abc import Iterable, Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
 
 from .arm import Arm, Array, Effort, Friction, Joint, Limits, Sensing, Shape
-from .errors import ArmError, MissingExtraError, suggest
+from .errors import ArmError, MissingExtraError, PalpateError, suggest
 
 try:
     import yaml
@@ -30,6 +30,7 @@ _MAX_DEPTH = 16
 _YAML_WORDS = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
 """other YAML readers take these for something else than text"""
 
+_File = TypeVar("_File", bound=BaseModel)
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Vector = tuple[_Finite, _Finite, _Finite]
 _Row = tuple[_Finite, _Finite, _Finite, _Finite]
@@ -39,11 +40,13 @@ _Placement = tuple[_Row, _Row, _Row]
 # --- schema -------------------------------------------------------------------------------------------------
 
 
-class _Model(BaseModel):
+class Strict(BaseModel):
+    """A mapping of a file: no key that it does not know."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class _Inertia(_Model):
+class _Inertia(Strict):
     xx: _Finite
     yy: _Finite
     zz: _Finite
@@ -52,7 +55,7 @@ class _Inertia(_Model):
     yz: _Finite = 0.0
 
 
-class _Friction(_Model):
+class _Friction(Strict):
     coulomb_Nm: _Finite = 0.0
     viscous_Nms_rad: _Finite = 0.0
     offset_Nm: _Finite = 0.0
@@ -63,14 +66,14 @@ class _Friction(_Model):
     presliding_rad: _Finite = 0.0
 
 
-class _Limits(_Model):
+class _Limits(Strict):
     lower_rad: float = -math.inf
     upper_rad: float = math.inf
     velocity_rad_s: float = math.inf
     effort_Nm: float = math.inf
 
 
-class _Sensing(_Model):
+class _Sensing(Strict):
     position_resolution_rad: _Finite = 0.0
     position_std_rad: _Finite = 0.0
     velocity_std_rad_s: _Finite | None = None
@@ -79,7 +82,7 @@ class _Sensing(_Model):
     torque_gain_std: _Finite = 0.0
 
 
-class _Joint(_Model):
+class _Joint(Strict):
     name: str
     link: str
     kind: Literal["revolute", "prismatic"] = "revolute"
@@ -94,7 +97,7 @@ class _Joint(_Model):
     sensing: _Sensing = _Sensing()
 
 
-class _Effort(_Model):
+class _Effort(Strict):
     kind: Literal["torque", "current", "phase_currents", "undeclared"]
     k_t_Nm_A: tuple[_Finite, ...] = (1.0,)
     gear: tuple[_Finite, ...] = (1.0,)
@@ -102,7 +105,7 @@ class _Effort(_Model):
     angle_offset_rad: tuple[_Finite, ...] = (0.0,)
 
 
-class _Shape(_Model):
+class _Shape(Strict):
     kind: Literal["box", "cylinder", "sphere", "capsule", "mesh"]
     link: str
     size_m: tuple[_Finite, ...]
@@ -111,12 +114,12 @@ class _Shape(_Model):
     filename: str | None = None
 
 
-class _Frame(_Model):
+class _Frame(Strict):
     link: str
     T_link_frame_m: _Placement
 
 
-class _Card(_Model):
+class _Card(Strict):
     palpate_card: Literal[1]
     written: dict[str, str] = {}
     name: str
@@ -187,6 +190,21 @@ _Loader.add_constructor("tag:yaml.org,2002:float", _number)
 
 def read_card(path: str | os.PathLike[str]) -> Arm:
     """See :meth:`palpate.Arm.from_card`."""
+    name, card = read_yaml(path, _Card, "card", ArmError)
+    try:
+        return _to_arm(card)
+    except ArmError as e:
+        raise ArmError(f"{name}: {e}") from None
+
+
+def read_yaml(
+    path: str | os.PathLike[str], schema: type[_File], what: str, error: type[PalpateError]
+) -> tuple[str, _File]:
+    """The name of a file and its content, checked; a ``palpate_<what>: 1`` in it says what it is.
+
+    Raises:
+        PalpateError: as `error`: it cannot be read, is no such file, or a field is wrong; the message names the place.
+    """
     try:
         file = Path(path)
         name = file.name
@@ -194,33 +212,28 @@ def read_card(path: str | os.PathLike[str]) -> Arm:
             data = stream.read(_MAX_BYTES + 1)
     except (OSError, TypeError, ValueError) as e:
         reason = e.strerror if isinstance(e, OSError) and e.strerror else str(e)
-        raise ArmError(f"cannot read the card {str(path)!r:.200}: {reason}") from None
+        raise error(f"cannot read the {what} {str(path)!r:.200}: {reason}") from None
     if len(data) > _MAX_BYTES:
-        raise ArmError(f"{name}: larger than {_MAX_BYTES // 2**20} MiB, which no arm's card is")
+        raise error(f"{name}: larger than {_MAX_BYTES // 2**20} MiB, which no {what} is")
     try:
         content = yaml.load(data, _Loader)
     except yaml.MarkedYAMLError as e:
         place = f"{name}:{e.problem_mark.line + 1}" if e.problem_mark else name
-        raise ArmError(f"{place}: malformed YAML: {e.problem}") from None
+        raise error(f"{place}: malformed YAML: {e.problem}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as e:
-        raise ArmError(f"{name}: malformed YAML: {' '.join(str(e).split())}") from None
-    if not isinstance(content, dict) or "palpate_card" not in content:
-        raise ArmError(f"{name}: not a palpate card: it must be a mapping with the key palpate_card: 1")
-    if content["palpate_card"] != 1:
-        raise ArmError(
-            f"{name}: palpate_card: version must be 1, got {content['palpate_card']!r:.40}; update palpate?"
-        )
+        raise error(f"{name}: malformed YAML: {' '.join(str(e).split())}") from None
+    key = f"palpate_{what}"
+    if not isinstance(content, dict) or key not in content:
+        raise error(f"{name}: not a palpate {what}: it must be a mapping with the key {key}: 1")
+    if content[key] != 1:
+        raise error(f"{name}: {key}: version must be 1, got {content[key]!r:.40}; update palpate?")
     try:
-        card = _Card.model_validate(content)
+        return name, schema.model_validate(content)
     except ValidationError as e:
-        raise ArmError(f"{name}: {_explain(e)}") from None
-    try:
-        return _to_arm(card)
-    except ArmError as e:
-        raise ArmError(f"{name}: {e}") from None
+        raise error(f"{name}: {_explain(e, schema)}") from None
 
 
-def _explain(error: ValidationError) -> str:
+def _explain(error: ValidationError, schema: type[BaseModel]) -> str:
     """The first complaint, with its path: ``joints[2].friction.viscous: unknown key; did you mean ...?``"""
     first = error.errors(include_url=False)[0]
     path = ""
@@ -229,29 +242,26 @@ def _explain(error: ValidationError) -> str:
     more = error.error_count() - 1
     tail = f" (and {more} more)" if more else ""
     if first["type"] == "extra_forbidden":
-        known = _keys_at(first["loc"][:-1])
+        known = _keys_at(first["loc"][:-1], schema)
         return f"{path}: unknown key; {suggest(str(first['loc'][-1]), known, 'known keys')}{tail}"
     got = "" if first["type"] == "missing" else f", got {first['input']!r:.60}"
     return f"{path}: {first['msg'][0].lower()}{first['msg'][1:]}{got}{tail}"
 
 
-def _keys_at(location: Iterable[int | str]) -> list[str]:
-    """The keys the schema knows at a place in the card."""
-    model: type[BaseModel] = _Card
-    inner: dict[str, type[BaseModel]] = {
-        "joints": _Joint,
-        "inertia_kg_m2": _Inertia,
-        "friction": _Friction,
-        "limits": _Limits,
-        "sensing": _Sensing,
-        "effort": _Effort,
-        "shapes": _Shape,
-        "frames": _Frame,
-    }
+def _keys_at(location: Iterable[int | str], schema: type[BaseModel]) -> list[str]:
+    """The keys the schema knows at a place in the file."""
+    model = schema
     for step in location:
-        if isinstance(step, str) and step in model.model_fields and step in inner:
-            model = inner[step]
+        if isinstance(step, str) and step in model.model_fields:
+            model = _model_in(model.model_fields[step].annotation) or model
     return list(model.model_fields)
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """The model a field holds: itself, or in a list or mapping."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((m for a in get_args(annotation) if (m := _model_in(a)) is not None), None)
 
 
 def _matrix(rows: _Placement) -> Array:
@@ -385,7 +395,7 @@ def _lines(value: Any, indent: str) -> list[str]:
     return lines
 
 
-def _differing(model: _Model) -> dict[str, Any]:
+def _differing(model: Strict) -> dict[str, Any]:
     """The fields that differ from the schema's default, as plain data."""
     return {
         k: list(v) if isinstance(v, tuple) else v

@@ -449,7 +449,7 @@ def test_data_get_asks_for_the_licence(palpate, monkeypatch: pytest.MonkeyPatch)
 
 def test_doctor_finds_everything_here(palpate) -> None:
     found = {f["what"]: f for f in palpate("doctor", "--json").json["findings"]}
-    for extra in ("cli", "card", "sim", "report"):
+    for extra in ("cli", "card", "sim", "report", "dynamixel", "feetech"):
         assert found[f"extra {extra}"]["ok"] is True
     assert "µs" in found["C++ core"]["found"]
 

@@ -24,6 +24,8 @@ _EXTRAS = {
     "sim": (("mujoco",), "simulated arms"),
     "report": (("matplotlib",), "reports and pictures"),
     "logs": (("rosbags", "lz4"), "compressed bags, any ROS 2 message"),
+    "dynamixel": (("dynamixel_sdk",), "arms of Dynamixel servos"),
+    "feetech": (("scservo_sdk",), "arms of Feetech servos"),
     "xacro": (("xacro",), "arms from .xacro files"),
     "data": (("pooch",), "palpate data get"),
     "vision": (("cv2",), "whiteboards in pictures"),

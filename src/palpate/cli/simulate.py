@@ -168,7 +168,7 @@ def run(
                 "arm": scene.arm.name,
                 "samples": len(log),
                 "duration_s": log.duration,
-                "loads": [{"time_s": t, "mass_kg": m} for t, m in task.loads],
+                "loads": [{"time_s": t, "mass_kg": m} for t, m in task.loads or ()],
                 "arrival_s": weighing.arrival(task),
                 "frames": 0 if film is None else film.count,
                 "seed": seed,
@@ -179,7 +179,7 @@ def run(
         )
     else:
         if not quiet:
-            held = ", ".join(f"{mass_text(m, float('nan'))} from {t:g} s" for t, m in task.loads)
+            held = ", ".join(f"{mass_text(m, float('nan'))} from {t:g} s" for t, m in task.loads or ())
             say(f"{scene.arm.name}: {len(log)} samples in {log.duration:g} s, held: {held or 'nothing'}")
             for remark in result.remarks:
                 say(f"! {remark}")

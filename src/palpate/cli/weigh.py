@@ -34,8 +34,11 @@ from ._common import (
     say,
     status_words,
 )
+from ._drivers import bus_summary, bus_words, make_driver
 
 if TYPE_CHECKING:
+    from ..arm import Arm
+    from ..drivers import Driver
     from ..weigh import Session, Task, Weighing
 
 _DEFAULT_ARM = "justina_left_arm"
@@ -47,14 +50,16 @@ def add(app: typer.Typer) -> None:
         "weigh",
         help="Weigh what an arm holds, without a force sensor.\n\n"
         "Without LOG a simulated arm lifts an object from rest to a grasping pose, with noise and quantisation. "
-        "With LOG the same is done for a recording of a real arm. Writes run.mcap (simulation only) and report.html "
-        "into the current folder; both replace those of an earlier run.",
+        "With LOG the same is done for a recording of a real arm. With --driver a real arm itself moves from where it "
+        "stands to --pose: hold it, its drives are off before and after. Writes run.mcap (not with LOG) and "
+        "report.html into the current folder; both replace those of an earlier run.",
         epilog=examples(
             "palpate weigh",
             "palpate weigh --mass 0.4 --pose StandBy --seed 7",
             "palpate weigh --arm kuka_lbr_iiwa7 --out /tmp/iiwa --json",
             "palpate weigh --duration 6 --picture weigh.png",
             "palpate weigh task.mcap --arm robot.arm.yaml",
+            "palpate weigh --driver dynamixel --port /dev/ttyUSB0 --bus bus.yaml --arm arm.yaml --pose 0,-0.5,1",
             "palpate weigh log.csv --columns columns.yaml --arm robot.urdf --tip tool0 --effort torque",
         ),
     )(run)
@@ -127,6 +132,30 @@ def run(
             show_default=False,
         ),
     ] = None,
+    driver: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="A real arm instead of a simulated one: dynamixel or feetech.",
+            show_default=False,
+        ),
+    ] = None,
+    port: Annotated[
+        str | None,
+        typer.Option(metavar="PATH", help="Its serial port, e.g. /dev/ttyUSB0.", show_default=False),
+    ] = None,
+    bus: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Which servo moves which joint. [default: ids 1, 2, ... in the order of the joints]",
+            show_default=False,
+        ),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(metavar="HZ", help="Its control rate. [default: 250]", show_default=False),
+    ] = None,
     columns: Columns = None,
     effort: Effort = None,
     base: Base = None,
@@ -152,8 +181,17 @@ def run(
     if log is not None:
         given = {"--mass": mass, "--pose": pose, "--start": start, "--speed": speed, "--picture": picture}
         _only("a simulation", "LOG is a recording", given)
+        _only("a real arm", "LOG is a recording", {"--driver": driver})
     else:
-        _only("a LOG", "nothing is recorded yet", {"--columns": columns, "--effort": effort})
+        _only("a LOG", "nothing is recorded yet", {"--columns": columns})
+    if driver is None:
+        _only("a real arm", "there is no --driver", {"--port": port, "--bus": bus, "--rate": rate})
+        if log is None:
+            _only("a LOG", "nothing is recorded yet", {"--effort": effort})
+    else:
+        given = {"--mass": mass, "--start": start, "--speed": speed, "--picture": picture}
+        _only("a simulation", "the arm is real", given)
+        _only("a real arm's card", "the driver says what its effort is", {"--effort": effort})
     page = out / "report.html"
     if report:
         make_folder(out)
@@ -161,6 +199,7 @@ def run(
     if picture is not None:
         check_target(picture, is_png, "the picture")
     files: dict[str, str] = {}
+    on_bus: dict[str, Any] | None = None
     scene_png = None
     live = not (json or quiet) and console().is_terminal
 
@@ -168,6 +207,28 @@ def run(
         model = None if arm is None else open_arm(arm, base=base, tip=tip, repair=repair, effort=effort)
         result = weighing.weigh_log(open_log(log, columns), model, estimator=estimator, observer=observer)
         title = f"What {result.arm.name} holds in {log.name}"
+    elif driver is not None:
+        model = _real_arm(arm, pose, base=base, tip=tip, repair=repair)
+        hardware = make_driver(driver, model, port, bus, 250.0 if rate is None else rate)
+        target = _recording(out) if record else None
+        with hardware:
+            scene = weighing.scene(weighing.driven_arm(model, hardware))
+            name, goal = weighing.find_pose(scene, pose or "")
+            task = weighing.Task(
+                scene=scene,
+                start=weighing.present_pose(scene.arm, hardware),
+                poses=(goal,),
+                loads=None,
+                duration=duration,
+                rate=1e9 / hardware.period_ns,
+            )
+            pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer)
+            session = _session(task, pipeline, target, live=live, pose=name, picture=False, driver=hardware)
+        result = weighing.weigh_session(session, pose=name)
+        on_bus = bus_summary(hardware, session)
+        if target is not None:
+            files["log"] = str(target)
+        title = f"What {scene.arm.name} holds"
     else:
         if mass is not None:
             weighing.check_mass(mass)
@@ -185,10 +246,7 @@ def run(
             speed=2.0 if live and speed is None else speed,
         )
         pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer)
-        target = None
-        if record:
-            target = make_folder(out) / "run.mcap"
-            check_target(target, is_recording, "the recording")
+        target = _recording(out) if record else None
         session = _session(
             task, pipeline, target, live=live, pose=name, picture=report or picture is not None
         )
@@ -211,12 +269,28 @@ def run(
         if picture is not None:
             files["picture"] = str(hero_picture(told, picture))
     if json:
-        emit({**result.summary(), "files": files})
+        emit({**result.summary(), **({} if on_bus is None else {"bus": on_bus}), "files": files})
     elif quiet:
         say(_short(result))
     else:
-        _tell(result, files)
+        _tell(result, files, on_bus)
     return STOPPED if result.interrupted else 0
+
+
+def _real_arm(arm: str | None, pose: str | None, *, base: str | None, tip: str | None, repair: bool) -> Arm:
+    """The arm's model; which arm it is and where it goes are not guessed where a real one moves."""
+    if arm is None:
+        raise InputError("--driver needs --arm: which arm hangs on the port?")
+    if pose is None:
+        raise InputError("--driver needs --pose: where may the arm go?")
+    return open_arm(arm, base=base, tip=tip, repair=repair)
+
+
+def _recording(out: Path) -> Path:
+    """Where the run is recorded."""
+    target = make_folder(out) / "run.mcap"
+    check_target(target, is_recording, "the recording")
+    return target
 
 
 def _only(where: str, why: str, given: dict[str, Any]) -> None:
@@ -226,17 +300,30 @@ def _only(where: str, why: str, given: dict[str, Any]) -> None:
 
 
 def _session(
-    task: Task, pipeline: Any, target: Path | None, *, live: bool, pose: str, picture: bool
+    task: Task,
+    pipeline: Any,
+    target: Path | None,
+    *,
+    live: bool,
+    pose: str,
+    picture: bool,
+    driver: Driver | None = None,
 ) -> Session:
     from ..weigh import run as run_session
     from ._live import LiveTable, interruptible
 
     with interruptible() as stopped:
         if not live:
-            return run_session(task, pipeline, record=target, stop=stopped, picture=picture)
+            return run_session(task, pipeline, driver=driver, record=target, stop=stopped, picture=picture)
         with LiveTable(task, pose) as table:
             return run_session(
-                task, pipeline, record=target, stop=stopped, progress=table.update, picture=picture
+                task,
+                pipeline,
+                driver=driver,
+                record=target,
+                stop=stopped,
+                progress=table.update,
+                picture=picture,
             )
 
 
@@ -247,7 +334,7 @@ def _short(result: Weighing) -> str:
     return text
 
 
-def _tell(result: Weighing, files: dict[str, str]) -> None:
+def _tell(result: Weighing, files: dict[str, str], on_bus: dict[str, Any] | None) -> None:
     """The result for people."""
     from rich.text import Text
 
@@ -272,8 +359,14 @@ def _tell(result: Weighing, files: dict[str, str]) -> None:
     if len(times):
         rows.append(("changes", _changes(result)))
     rows.append(
-        ("method", result.method() + (f", seed {result.task.seed}" if result.task is not None else ""))
+        (
+            "method",
+            result.method()
+            + (f", seed {result.task.seed}" if result.task is not None and result.task.simulated else ""),
+        )
     )
+    if on_bus is not None:
+        rows.append(("bus", bus_words(on_bus)))
     if result.task is None:
         repair = str(result.log.repair).splitlines()
         rows.append(("read", "\n".join(repair)))
@@ -286,6 +379,8 @@ def _what(result: Weighing) -> str:
     size = f"{len(log)} samples, {log.duration:.3g} s, {log.rate:.3g} Hz"
     if result.task is None:
         return f"{result.arm.name}: {size}"
+    if not result.task.simulated:
+        return f"{result.arm.name} moves to pose {result.pose}: {size}"
     thing = "an object" if result.task.mass_at(result.task.duration) > 0.0 else "nothing"
     return f"{result.arm.name} (simulated) lifts {thing} to pose {result.pose}: {size}"
 

@@ -1,7 +1,8 @@
-"""The application that weighs: a simulated arm, or a log; and the replay of what was recorded."""
+"""The application that weighs: an arm, simulated or real, or a log; and the replay of what was recorded."""
 
 from __future__ import annotations
 
+from .hardware import driven_arm, present_pose
 from .proposal import TwoWayMotion, two_way_motion
 from .replay import Difference, Replay, replay
 from .scenes import Scene, find_pose, load_arm, scene, telling_pose, weight_torque
@@ -22,11 +23,13 @@ __all__ = [
     "arrival",
     "brick",
     "check_mass",
+    "driven_arm",
     "find_pose",
     "fit_joints",
     "fit_log",
     "load_arm",
     "make_pipeline",
+    "present_pose",
     "refused",
     "replay",
     "run",

@@ -1,11 +1,12 @@
-"""The closed loop: a simulated arm moves through poses with an object in its hand, is weighed by, and is recorded."""
+"""The closed loop: an arm, simulated or real, moves an object through poses, is weighed by, and is recorded."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,16 +24,19 @@ from ..pipeline import ExternalTorque, Payload, Pipeline, Touch
 from .scenes import NOISE_COUNTS, Scene, gains_at
 
 if TYPE_CHECKING:
+    from ..drivers import Driver
     from ..drivers.mujoco import MujocoDriver
-    from ..simulate import Load
+    from ..simulate import Load, Plant
 
 PROGRESS_S = 0.1
 """time between two calls of progress [s], simulated"""
+_PATIENCE_S = 1.0
+"""how long a real arm goes on at the end where samples have just been lost [s]"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """What a simulated arm is asked to do.
+    """What an arm is asked to do.
 
     Raises:
         InputError: a number is out of range.
@@ -43,8 +47,8 @@ class Task:
     """(n,) [rad], at rest"""
     poses: tuple[Array, ...]
     """(n,) each [rad], visited in turn; the last one is held"""
-    loads: tuple[tuple[float, float], ...] = ()
-    """(time [s], mass [kg]): what is in the hand from then on; 0 kg: nothing"""
+    loads: tuple[tuple[float, float], ...] | None = ()
+    """(time [s], mass [kg]): what is in the hand from then on; 0 kg: nothing. None: a real arm, nobody knows"""
     duration: float = 10.0
     """[s]"""
     move: float = 3.0
@@ -78,17 +82,23 @@ class Task:
             _within("speed", self.speed, 0.0, 1e6, "simulated seconds per second")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise InputError(f"seed must be a whole number >= 0, got {self.seed!r}")
-        for time, mass in self.loads:
+        loads = self.loads or ()
+        for time, mass in loads:
             if not (math.isfinite(time) and time >= 0.0):
                 raise InputError(f"time of a load must be a number >= 0 s, got {time!r}")
             check_mass(mass)
-        times = [time for time, _ in self.loads]
+        times = [time for time, _ in loads]
         if times != sorted(set(times)):
             raise InputError(f"times of the loads must ascend, got {', '.join(f'{t:g}' for t in times)} s")
 
+    @property
+    def simulated(self) -> bool:
+        """Whether the arm is; of a real one nobody knows what it holds."""
+        return self.loads is not None
+
     def mass_at(self, time: float) -> float:
-        """What is in the hand at a time [s], [kg]."""
-        held = [mass for t, mass in self.loads if t <= time]
+        """What is in a simulated hand at a time [s], [kg]."""
+        held = [mass for t, mass in self.loads or () if t <= time]
         return held[-1] if held else 0.0
 
 
@@ -129,7 +139,7 @@ class Session:
     pipeline: Mapping[str, Any]
     """options of the pipeline, see :meth:`palpate.Pipeline.options`"""
     log: Log
-    """every sample as read, with the truth among its signals"""
+    """every sample as read, of a simulated arm with the truth among its signals"""
     touch: Touch
     """one row per sample, as it was known then"""
     desired_q: Array
@@ -176,7 +186,7 @@ def _driver(task: Task) -> MujocoDriver:
         seed=task.seed,
     )
     events = []
-    for time, mass in task.loads:
+    for time, mass in task.loads or ():
         load = brick(mass)
         events.append(Release(time) if load is None else Attach(time, load))
     return MujocoDriver(arm, sensor=sensor, schedule=Schedule(events), q=task.start, pace=task.speed)
@@ -253,7 +263,7 @@ def describe(task: Task, pipeline: Pipeline) -> dict[str, str]:
         "arm": arm.name,
         "start_rad": task.start.tolist(),
         "poses_rad": [q.tolist() for q in task.poses],
-        "loads_s_kg": [list(load) for load in task.loads],
+        "loads_s_kg": None if task.loads is None else [list(load) for load in task.loads],
         "duration_s": task.duration,
         "move_s": task.move,
         "hold_s": task.hold,
@@ -285,7 +295,9 @@ OUTPUTS = {
 }
 
 
-def _record(recorder: Recorder, moment: Moment, sent: Array, gain: Array, plant: Any, mass: float) -> None:
+def _record(
+    recorder: Recorder, moment: Moment, sent: Array, gain: Array, truth: tuple[Array, Array, float] | None
+) -> None:
     time_ns, touch = moment.sample.time_ns, moment.touch
     recorder.sample(*moment.sample)
     external, payload = touch.external, touch.payload
@@ -304,15 +316,18 @@ def _record(recorder: Recorder, moment: Moment, sent: Array, gain: Array, plant:
         recorder.signal(name, time_ns, value, unit)
     recorder.setpoint(time_ns, moment.setpoint.q, moment.setpoint.dq)
     recorder.command(time_ns, sent / gain)
-    recorder.signal("true_position", time_ns, plant.q, "rad")
-    recorder.signal("true_velocity", time_ns, plant.dq, "rad/s")
-    recorder.signal("true_mass", time_ns, mass, "kg")
+    if truth is not None:
+        q, dq, mass = truth
+        recorder.signal("true_position", time_ns, q, "rad")
+        recorder.signal("true_velocity", time_ns, dq, "rad/s")
+        recorder.signal("true_mass", time_ns, mass, "kg")
 
 
 def run(
     task: Task,
     pipeline: Pipeline,
     *,
+    driver: Driver | None = None,
     record: Path | None = None,
     progress: Callable[[Moment], None] | None = None,
     stop: Callable[[], bool] | None = None,
@@ -320,7 +335,7 @@ def run(
     frames: Callable[[npt.NDArray[np.uint8]], None] | None = None,
     frame_rate: float = 25.0,
 ) -> Session:
-    """Let a simulated arm do a task; each of its samples goes through the pipeline.
+    """Let an arm do a task; each of its samples goes through the pipeline.
 
     The controller is fed the state and the load of the pipeline's payload filter, or of one of its own where the
     pipeline weighs by another method: then the motion does not depend on the method.
@@ -328,8 +343,9 @@ def run(
     Args:
         task: what to do.
         pipeline: weighs; of the scene's arm, fresh.
+        driver: of a real arm, where the task's loads are None; it is closed at the end, the drives off.
         record: file (.mcap) or folder to record every input and output to; it is replaced.
-        progress: called every PROGRESS_S of simulated time.
+        progress: called every PROGRESS_S of the arm's time.
         stop: asked before every period; True stops the arm and ends the session, the record included.
         picture: draw the arm as it stands at the end.
         frames: called with a picture (720, 960, 3), `frame_rate` times per simulated second.
@@ -337,19 +353,30 @@ def run(
 
     Raises:
         LogError: the record cannot be written.
-        InputError: the simulation diverged, or the pipeline is of another arm.
+        InputError: the simulation diverged, or the pipeline or the driver is of another arm.
+        DriverError: the arm is lost; its drives have been stopped, and what was recorded until then is kept.
         MissingExtraError: mujoco is not installed.
     """
     arm = task.scene.arm
     if pipeline.arm is not arm:
         raise InputError("the pipeline must be made for the task's arm: task.scene.arm")
+    if (driver is None) != task.simulated:
+        raise InputError(
+            "a task with loads is for a simulated arm; a driver needs a task whose loads are None"
+        )
     filtered = isinstance(pipeline.payload, PayloadFilter)
     control = pipeline if filtered else Pipeline(arm)
     route = _Route(task)
     controller = _Control(task, route)
     gain = arm.effort.gain(arm.n)
-    driver = _driver(task)
-    count = round(task.duration * task.rate) + 1
+    plant: Plant | None = None
+    periods: Iterable[int] = itertools.count()
+    if driver is None:
+        driver = simulated = _driver(task)
+        plant = simulated.plant
+        periods = range(round(task.duration * task.rate) + 1)
+    elif driver.joint_names != arm.joint_names or driver.effort != arm.effort:
+        raise InputError(f"the driver's joints or its effort are not those of arm {arm.name!r}")
     rows = _Rows(arm.n)
     interrupted = False
     next_progress = next_frame = 0.0
@@ -364,7 +391,8 @@ def run(
         with driver:
             driver.enable()
             last_ns: int | None = None
-            for _ in range(count):
+            first_ns: int | None = None
+            for _ in periods:
                 if stop is not None and stop():
                     interrupted = True
                     driver.stop()
@@ -374,37 +402,51 @@ def run(
                     continue
                 touch = pipeline.step(sample)
                 state = touch if control is pipeline else control.step(sample)
-                time = sample.time_ns * 1e-9
+                if first_ns is None:
+                    first_ns = 0 if task.simulated else sample.time_ns
+                time = (sample.time_ns - first_ns) * 1e-9
                 setpoint = route.sample(time)
                 dt = 1.0 / task.rate if last_ns is None else (sample.time_ns - last_ns) * 1e-9
                 torque, status = controller.step(time, setpoint, state, control.load, dt)
                 sent = driver.write(torque)
                 last_ns = sample.time_ns
                 moment = Moment(time, sample, touch, setpoint, status)
-                load = driver.plant.load
-                mass = 0.0 if load is None else load.mass
-                rows.add(moment, sent, driver.plant.q, mass)
+                truth = None if plant is None else _truth(plant)
+                rows.add(moment, sent, truth)
                 if recorder is not None:
-                    _record(recorder, moment, sent, gain, driver.plant, mass)
+                    _record(recorder, moment, sent, gain, truth)
                 if progress is not None and time >= next_progress:
                     next_progress += PROGRESS_S
                     progress(moment)
-                if frames is not None and time >= next_frame:
+                if frames is not None and plant is not None and time >= next_frame:
                     next_frame += 1.0 / frame_rate
-                    frames(driver.plant.render())
+                    frames(plant.render())
+                if not task.simulated and _over(task, time, touch):
+                    break
             if recorder is not None and interrupted and last_ns is not None:
                 recorder.event(last_ns, "stop", "stopped before its end, by request")
-            if picture:
+            if picture and plant is not None:
                 from ..simulate import Camera
 
                 try:
-                    drawn = driver.plant.render(camera=Camera(azimuth=None, elevation=-20.0))
+                    drawn = plant.render(camera=Camera(azimuth=None, elevation=-20.0))
                 except PalpateError as e:
                     error = str(e)  # a weighing without a picture is one all the same; the caller tells why
     finally:
         if recorder is not None:
             recorder.close()
     return rows.session(task, pipeline, interrupted, drawn, error)
+
+
+def _over(task: Task, time: float, touch: Touch) -> bool:
+    """Whether a real arm may stop: not just behind samples that were lost, if it can be helped."""
+    late = time - task.duration
+    return late >= 0.0 and (Status(touch.payload.status) != Status.gap or late >= _PATIENCE_S)
+
+
+def _truth(plant: Plant) -> tuple[Array, Array, float]:
+    """Positions [rad], velocities [rad/s] and mass held [kg]."""
+    return plant.q, plant.dq, 0.0 if plant.load is None else plant.load.mass
 
 
 class _Rows:
@@ -414,12 +456,13 @@ class _Rows:
         self._n = n
         self._moments: list[Moment] = []
         self._sent: list[Array] = []
-        self._truth: list[tuple[Array, float]] = []
+        self._truth: list[tuple[Array, Array, float]] = []
 
-    def add(self, moment: Moment, sent: Array, q: Array, mass: float) -> None:
+    def add(self, moment: Moment, sent: Array, truth: tuple[Array, Array, float] | None) -> None:
         self._moments.append(moment)
         self._sent.append(sent)
-        self._truth.append((q, mass))
+        if truth is not None:
+            self._truth.append(truth)
 
     def session(
         self,
@@ -441,16 +484,18 @@ class _Rows:
         time_ns = np.array([m.sample.time_ns for m in moments], dtype=np.int64)
         velocities = [m.sample.velocity for m in moments]
         measured = [v for v in velocities if v is not None]
+        signals = {}
+        if task.simulated:
+            mass = np.array([m for _, _, m in self._truth], dtype=np.float64)
+            signals["true_position"] = Signal(time_ns, matrix([q for q, _, _ in self._truth]), "rad")
+            signals["true_mass"] = Signal(time_ns, mass, "kg")
         log = Log(
             time_ns=time_ns,
             position=matrix([m.sample.position for m in moments]),
             velocity=matrix(measured) if measured else None,
             effort=matrix([m.sample.effort for m in moments]),
             joint_names=task.scene.arm.joint_names,
-            signals={
-                "true_position": Signal(time_ns, matrix([q for q, _ in self._truth]), "rad"),
-                "true_mass": Signal(time_ns, np.array([m for _, m in self._truth], dtype=np.float64), "kg"),
-            },
+            signals=signals,
         )
         touch = Touch(
             time_ns,

@@ -186,7 +186,7 @@ class Weighing:
             "goal_error_rad": _plain(self.goal_error),
             "estimator": payload.get("name"),
             "observer": observer.get("name"),
-            "seed": None if self.task is None else self.task.seed,
+            "seed": None if self.task is None or not self.task.simulated else self.task.seed,
             "duration_s": _plain(self.log.duration),
             "samples": len(self.log),
             "changes_s": [_plain(t) for t in self.change_times],
@@ -216,9 +216,10 @@ class Weighing:
         from ..report import WeighReport
 
         touch, log = self.touch, self.log
-        simulated = self.task is not None
+        live = self.task is not None
+        simulated = self.task is not None and self.task.simulated
         if title is None:
-            title = "Weighing in simulation" if simulated else "Weighing from a log"
+            title = "Weighing in simulation" if simulated else "Weighing" if live else "Weighing from a log"
         seen = bool(np.any(touch.external.status == int(Status.ok)))
         desired = (None, None) if self.desired is None else self.desired
         settled = self.time_to_2_percent
@@ -249,7 +250,7 @@ class Weighing:
             effort=log.effort,
             effort_unit="A" if self.arm.effort.kind == "current" else "N m",
             settings=_settings(self),
-            repair=() if simulated else str(log.repair).splitlines(),
+            repair=() if live else str(log.repair).splitlines(),
             provenance=[*self.remarks, *(f"{k}: {v}" for k, v in self.arm.provenance.items())],
             picture=picture,
         )
@@ -270,11 +271,11 @@ def _settings(weighing: Weighing) -> dict[str, object]:
     if task is not None:
         found |= {
             "pose": weighing.pose,
-            "seed": task.seed,
             "rate [Hz]": task.rate,
-            "encoder noise": "± 2 counts" if task.noise else "none",
             "motion [s]": arrival(task),
         }
+        if task.simulated:
+            found |= {"seed": task.seed, "encoder noise": "± 2 counts" if task.noise else "none"}
     return found
 
 
@@ -369,7 +370,7 @@ def _known(what: str, name: str | None, choices: tuple[str, ...]) -> None:
 
 
 def weigh_session(session: Session, *, pose: str = "", scene: Scene | None = None) -> Weighing:
-    """What a simulated session weighed."""
+    """What a session weighed."""
     task = session.task
     scene = scene or task.scene
     arm, log = task.scene.arm, session.log
@@ -390,7 +391,7 @@ def weigh_session(session: Session, *, pose: str = "", scene: Scene | None = Non
         log=log,
         touch=session.touch,
         status=status,
-        truth=_truth(log, task.loads),
+        truth=_truth(log, task.loads) if task.simulated else (np.empty(0), np.empty(0)),
         task=task,
         pose=pose,
         desired=(session.desired_q, session.desired_dq),
@@ -404,7 +405,8 @@ def _arrived(session: Session) -> tuple[float, tuple[bool, str] | None]:
     """Largest distance of a joint from the goal [rad]; if torque limits hold it back: whether it fails, in words."""
     task, log = session.task, session.log
     arm, goal = task.scene.arm, task.poses[-1]
-    error = float(np.max(np.abs(log.signals["true_position"].value[-1] - goal)))
+    at = log.signals["true_position"].value if task.simulated else log.position
+    error = float(np.max(np.abs(at[-1] - goal)))
     last = log.seconds > log.seconds[-1] - 1.0
     held_back = np.mean(session.control[last] == int(Status.saturated)) > 0.5
     if log.seconds[-1] < arrival(task) or error < 0.02 or not held_back:
