@@ -302,6 +302,8 @@ class Server:
         self.listen()
 
     def listen(self) -> None:
+        if self.listeners:
+            return
         for port in (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT):
             listener = socket.socket()
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -6,9 +6,15 @@ the vendor's RTDE guide; what ur_rtde's control program does was measured with u
 
 from __future__ import annotations
 
+import contextlib
+import json
+import select
 import socket
 import struct
+import subprocess
+import sys
 import time
+from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -122,7 +128,7 @@ class UrDriver(Driver):
         self._version = (0, 0)
         self._has_payload = False
         self._receive: Any = None
-        self._control: Any = None
+        self._control: _Control | None = None
         self._stamp = 0.0
         self._arrived = 0.0
         self._q: Array = np.zeros(6)
@@ -220,6 +226,7 @@ class UrDriver(Driver):
 
     def _connect(self) -> None:
         try:
+            import rtde_control  # noqa: F401  # what enable() will need is missed here already
             import rtde_receive
         except ImportError:
             raise MissingExtraError("ur", "a UR arm") from None
@@ -320,25 +327,20 @@ class UrDriver(Driver):
         hindrance = self._hindrance()
         if hindrance:
             raise DriverError(f"enable(): {hindrance}; clear that on the pendant first")
-        import rtde_control
-
-        try:
-            if self._control is None:
-                self._control = rtde_control.RTDEControlInterface(self._host, self._frequency)
-            else:
-                self._control.reuploadScript()
-            deadline = time.monotonic() + _START_S
-            while not (self._control.isProgramRunning() and self._receive.getRobotStatus() & _PROGRAM):
-                if time.monotonic() > deadline:
-                    raise DriverError(f"enable(): the control program did not start within {_START_S:g} s")
-                time.sleep(1e-3)
-            guarded = self._control.setWatchdog(1.0 / self._watchdog)
-        except RuntimeError as error:
-            raise DriverError(f"enable(): {self._host}: {error}") from None
+        if self._control is None:
+            self._control = _Control(self._host, self._frequency)
+        else:
+            self._control.call("reuploadScript")
+        deadline = time.monotonic() + _START_S
+        while not (self._receive.getRobotStatus() & _PROGRAM and self._control.call("isProgramRunning")):
+            if time.monotonic() > deadline:
+                raise DriverError(f"enable(): the control program did not start within {_START_S:g} s")
+            time.sleep(1e-3)
+        guarded = self._control.call("setWatchdog", 1.0 / self._watchdog)
         if not guarded:
             raise DriverError("enable(): the controller did not accept the watchdog")
         if self._mode == "torque":
-            self._control.directTorque([0.0] * 6, [0.0] * 6, [0.0] * 6)
+            self._control.call("directTorque", [0.0] * 6, [0.0] * 6, [0.0] * 6)
         self._await_package("enable()")
 
     def _write(self, torque: Array) -> Array:
@@ -360,13 +362,8 @@ class UrDriver(Driver):
         age = time.monotonic() - self._arrived
         if age > self._watchdog:
             raise DriverError(f"the last sample is {age:.2f} s old; read() comes before every command")
-        if not self._control.isConnected():
-            raise DriverError(f"the connection to {self._host} is lost; close() and connect() again")
-        try:
-            taken = getattr(self._control, verb)(*arguments)
-        except (RuntimeError, ValueError) as error:
-            raise DriverError(f"{self._host} refused {verb}: {error}") from None
-        if not taken:
+        assert self._control is not None  # enabled
+        if not self._control.call(verb, *arguments, patience=self._watchdog):
             raise DriverError(
                 f"{self._host} refused {verb}: {self._hindrance() or 'its program has ended'}"
             )
@@ -376,33 +373,86 @@ class UrDriver(Driver):
         if control is None:
             return
         silent = self._receive.getTimestamp() == self._stamp
-        if (silent and time.monotonic() - self._arrived > self._watchdog) or not control.isConnected():
-            # ur_rtde would reconnect and start its program again; the controller's watchdog stops the arm
+        if silent and time.monotonic() - self._arrived > self._watchdog:
+            # nobody hears a command; the controller's watchdog stops the arm
             self._control = None
-            control.disconnect()
+            control.kill()
             return
-        if not control.isProgramRunning():
+        if not self._receive.getRobotStatus() & _PROGRAM:
             return
-        if self._mode == "speed":
-            control.speedStop(_DECELERATION)
-        elif self._mode == "servo":
-            control.servoStop(_DECELERATION)
-        elif self._mode == "force":
-            control.forceModeStop()
-        else:
-            control.stopJ(_DECELERATION)
-        control.stopScript()
-        if control.isProgramRunning():
-            raise DriverError(
-                f"the control program at {self._host} did not end: use the emergency stop if the arm moves"
-            )
+        try:
+            if self._mode == "speed":
+                control.call("speedStop", _DECELERATION)
+            elif self._mode == "servo":
+                control.call("servoStop", _DECELERATION)
+            elif self._mode == "force":
+                control.call("forceModeStop")
+            else:
+                control.call("stopJ", _DECELERATION)
+            control.call("stopScript")
+        except DriverError:
+            # without commands the controller's watchdog stops the arm
+            self._control = None
+            control.kill()
+            raise
 
     def _close(self) -> None:
         control, receive = self._control, self._receive
         self._control = self._receive = None
-        for client in (control, receive):
-            if client is not None:
-                client.disconnect()
+        if control is not None:
+            control.kill()
+        if receive is not None:
+            receive.disconnect()
+
+
+class _Control:
+    """ur_rtde's control client in a process that can be killed; see ``_ur_control.py``.
+
+    Raises:
+        DriverError: the controller does not let itself be controlled.
+    """
+
+    def __init__(self, host: str, frequency: float) -> None:
+        self._host = host
+        self._process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("_ur_control.py")), host, str(frequency)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        try:
+            self.call("connect", patience=_START_S)
+        except DriverError:
+            self.kill()
+            raise
+
+    def call(self, verb: str, *arguments: Any, patience: float = _CONNECT_S) -> Any:
+        """What the client's `verb` returns; an error if it has not returned after `patience` seconds."""
+        stdin, stdout = self._process.stdin, self._process.stdout
+        assert stdin is not None and stdout is not None  # pipes were asked for
+        try:
+            stdin.write(json.dumps([verb, arguments]).encode() + b"\n")
+            stdin.flush()
+            ready, _, _ = select.select([stdout], [], [], patience)
+            line = stdout.readline() if ready else None
+        except OSError as error:
+            raise DriverError(f"{verb}: ur_rtde has ended ({error})") from None
+        if line is None:
+            raise DriverError(f"{verb}: no answer from {self._host} within {patience:g} s")
+        if not line:
+            raise DriverError(f"{verb}: ur_rtde has ended")
+        answer, *complaint = json.loads(line)
+        if complaint:
+            raise DriverError(f"{verb}: {self._host}: {' '.join(complaint[0].split())}")
+        return answer
+
+    def kill(self) -> None:
+        """End the client now; its connections are closed by that."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            with contextlib.suppress(BrokenPipeError):  # a command that was under way
+                pipe.close()
 
 
 def _probe(host: str, frequency: float) -> tuple[tuple[int, int], dict[str, str]]:
