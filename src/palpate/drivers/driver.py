@@ -128,9 +128,9 @@ class Driver(ABC):
         Raises:
             DriverError: not enabled; the shape is wrong; a number is NaN or infinite.
         """
-        return self._command("write()", "torque", "N m", torque, self._joint_names, self._write)
+        return self._checked("write()", "torque", "N m", torque, self._joint_names, self._write)
 
-    def _command(
+    def _checked(
         self,
         verb: str,
         what: str,

@@ -170,7 +170,7 @@ class UrDriver(Driver):
             self._transmit("speed", "speedJ", dq.tolist(), float(acceleration), 0.0)
             return dq
 
-        return self._command("speed()", "speed", "rad/s", dq, self._joint_names, send)
+        return self._checked("speed()", "speed", "rad/s", dq, self._joint_names, send)
 
     def servo(self, q: npt.ArrayLike) -> Array:
         """Follow joint positions `q` (6,) [rad], one after the other: near where the arm is, once per period.
@@ -187,7 +187,7 @@ class UrDriver(Driver):
             self._transmit("servo", "servoJ", q.tolist(), 0.0, 0.0, period, _LOOKAHEAD_S, _SERVO_GAIN)
             return q
 
-        return self._command("servo()", "position", "rad", q, self._joint_names, send)
+        return self._checked("servo()", "position", "rad", q, self._joint_names, send)
 
     def force(
         self,
@@ -222,7 +222,7 @@ class UrDriver(Driver):
             )
             return wrench
 
-        return self._command("force()", "wrench", "N, N m", wrench, _WRENCH, send)
+        return self._checked("force()", "wrench", "N, N m", wrench, _WRENCH, send)
 
     def _connect(self) -> None:
         try:
