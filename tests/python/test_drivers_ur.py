@@ -140,9 +140,7 @@ class TestCommanding:
             assert state["mode"] == "hold" and not state["program"]
 
     def test_torque_is_clamped_to_the_arms_limits(self, ur: UrController) -> None:
-        limited = ARM.replace(
-            joints=tuple(j.replace(limits=pp.Limits(effort=40.0)) for j in ARM.joints)
-        )
+        limited = ARM.replace(joints=tuple(j.replace(limits=pp.Limits(effort=40.0)) for j in ARM.joints))
         with UrDriver(limited, HOST, mode="torque") as driver:
             driver.enable()
             following(driver)
@@ -221,7 +219,9 @@ class TestCommanding:
 
 
 class TestSafety:
-    @pytest.mark.parametrize(("order", "said"), [("protective", "protective stop"), ("emergency", "emergency stop")])
+    @pytest.mark.parametrize(
+        ("order", "said"), [("protective", "protective stop"), ("emergency", "emergency stop")]
+    )
     def test_a_stop_ends_control_and_is_named(self, ur: UrController, order: str, said: str) -> None:
         with UrDriver(ARM, HOST, mode="speed") as driver:
             driver.enable()

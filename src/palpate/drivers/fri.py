@@ -155,7 +155,7 @@ class FriDriver(Driver):
         self._port, self._address, self._controller = port, address, controller
         self._sign, self._patience = float(torque_sign), float(patience)
         self._limit = np.array([j.limits.effort for j in arm.joints])
-        self._messages = _messages()
+        self._messages, self._undecodable = _messages()
         self._socket: socket.socket | None = None
         self._forget()
 
@@ -335,7 +335,7 @@ class FriDriver(Driver):
         message = self._messages["Monitoring"]()
         try:
             message.ParseFromString(data)
-        except ValueError:  # protobuf's DecodeError is one
+        except self._undecodable:
             return None
         if message.header.message_id != _MONITORING_ID or message.connection.session_state not in range(1, 5):
             return None
@@ -380,7 +380,9 @@ class FriDriver(Driver):
             return f"the controller reports: {self.session}"
         idle = [i for i, drive in enumerate(robot.drive_state) if _name(_DRIVES, drive) != "ACTIVE"]
         if idle:
-            return f"the drive of {self._joint_names[idle[0]]!r} is {_name(_DRIVES, robot.drive_state[idle[0]])}"
+            return (
+                f"the drive of {self._joint_names[idle[0]]!r} is {_name(_DRIVES, robot.drive_state[idle[0]])}"
+            )
         return ""
 
     def _enable(self) -> None:
@@ -495,20 +497,22 @@ def _name(names: tuple[str, ...], value: int) -> str:
     return names[value] if 0 <= value < len(names) else f"unknown ({value})"
 
 
-def _messages() -> Mapping[str, Any]:
-    """Message classes made from the table above.
+def _messages() -> tuple[Mapping[str, Any], type[Exception]]:
+    """Message classes made from the table above, and the error of bytes that are none.
 
     Raises:
         MissingExtraError: protobuf is not installed.
     """
     try:
-        from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+        from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
     except ImportError:
         raise MissingExtraError("fri", "a KUKA arm") from None
     kinds = descriptor_pb2.FieldDescriptorProto
-    file = descriptor_pb2.FileDescriptorProto(name="palpate_fri.proto", package="palpate_fri", syntax="proto2")
-    for message, fields in _FIELDS.items():
-        described = file.message_type.add(name=message)
+    file = descriptor_pb2.FileDescriptorProto(
+        name="palpate_fri.proto", package="palpate_fri", syntax="proto2"
+    )
+    for name, fields in _FIELDS.items():
+        described = file.message_type.add(name=name)
         for field, (number, kind) in fields.items():
             added = described.field.add(name=field, number=number)
             # repeated numbers are sent one by one, proto2's default; read they are either way
@@ -519,7 +523,8 @@ def _messages() -> Mapping[str, Any]:
                 added.type = getattr(kinds, f"TYPE_{kind.rstrip('*').upper()}")
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    return {
+    classes = {
         name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"palpate_fri.{name}"))
         for name in _FIELDS
     }
+    return classes, message.DecodeError

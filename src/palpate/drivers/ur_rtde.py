@@ -364,9 +364,7 @@ class UrDriver(Driver):
             raise DriverError(f"the last sample is {age:.2f} s old; read() comes before every command")
         assert self._control is not None  # enabled
         if not self._control.call(verb, *arguments, patience=self._watchdog):
-            raise DriverError(
-                f"{self._host} refused {verb}: {self._hindrance() or 'its program has ended'}"
-            )
+            raise DriverError(f"{self._host} refused {verb}: {self._hindrance() or 'its program has ended'}")
 
     def _disable(self) -> None:
         control = self._control
