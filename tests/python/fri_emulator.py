@@ -288,9 +288,9 @@ class FriController(threading.Thread):
     def _await(self, due: float) -> Command | None:
         """The answer to this cycle's message, if it comes in time."""
         command = None
-        end = due if self.realtime else time.monotonic() + 0.1
+        end = due if self.realtime else time.monotonic() + (0.4 if self.commands else 0.05)
         while command is None and not self._over.is_set():
-            self.socket.settimeout(max(1e-4, end - time.monotonic()))
+            self.socket.settimeout(min(max(1e-4, end - time.monotonic()), 0.05))
             try:
                 data = self.socket.recv(2000)
             except (TimeoutError, ConnectionRefusedError):

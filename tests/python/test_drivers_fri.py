@@ -1,16 +1,20 @@
-"""The FRI driver against an emulated controller, with lost, late, doubled and hostile packets. No real one was at hand."""
+"""The FRI driver against an emulated controller: lost, late, doubled, hostile packets. No real one was at hand."""
 
 from __future__ import annotations
 
+import json
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 
 import numpy as np
 import pytest
-from fri_emulator import ACTIVE, ARM, HOME, FriController, Network, block, doubles, fields, number
 
+import fri_emulator
 import palpate as pp
+from fri_emulator import ACTIVE, ARM, HOME, FriController, Network, block, doubles, fields, number
 from palpate.arm import Arm
 from palpate.drivers import Driver, Sample
 from palpate.drivers.fri import FriDriver
@@ -109,9 +113,10 @@ class TestTorque:
             driver.enable()
             sample = following(driver)
             twin.reset(sample.position)
+            push = np.array([0, 3.0, 0, 0, 0, 0, 0])
             rows = []
             for _ in range(50):
-                driver.write(ARM.gravity_torque(sample.position) + [0, 3.0, 0, 0, 0, 0, 0])
+                driver.write(ARM.gravity_torque(sample.position) + push)
                 sample = following(driver)
                 rows.append(sample)
             for row in rows:
@@ -432,3 +437,33 @@ class TestRefusals:
     def test_nonsense(self, options: dict[str, object], message: str) -> None:
         with pytest.raises(DriverError, match=message):
             make(**options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", [0.0, 0.01])
+def test_two_milliseconds_for_a_minute(loss: float) -> None:
+    """A wrench overlay in real time, the controller in a process of its own; the figures are printed."""
+    run = [sys.executable, fri_emulator.__file__, str(PORT), "60", str(loss)]
+    answers, ended = [], 0
+    with subprocess.Popen(run, stdout=subprocess.PIPE, text=True) as process:
+        with make(mode="wrench", patience=3.0) as driver:
+            driver.enable()
+            with pytest.raises(DriverError, match="the session is over"):
+                while True:
+                    sample = driver.read()
+                    begin = time.monotonic()
+                    if driver.state != "enabled":
+                        ended += 1
+                        driver.enable()
+                    elif sample is not None:
+                        driver.wrench([0, 0, 0.1 * np.sin(sample.time_ns * 1e-9), 0, 0, 0])
+                        answers.append(time.monotonic() - begin)
+            late, lost = driver.late, driver.lost
+        assert process.stdout is not None
+        seen = json.loads(process.stdout.read())
+    p50, p999 = np.percentile(answers, [50, 99.9]) * 1e6
+    print(
+        f"FRI 2 ms, {loss:.0%} lost each way: {seen['cycles']} cycles, {seen['missed']} without an answer in time, "
+        f"{lost} not seen, {late} late, session ended {ended} times; a command takes {p50:.0f} us, p99.9 {p999:.0f} us"
+    )
+    assert ended == seen["fell_back"] and len(answers) > 0.9 * seen["cycles"]

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from ur_emulator import HOME, RTDE_PORT, UrController, ur5e
 
 import palpate as pp
 from palpate.arm import Arm, Array, Effort
@@ -17,6 +16,7 @@ from palpate.drivers import Driver, Sample
 from palpate.drivers.laws import DriverLaws
 from palpate.drivers.ur_rtde import UrDriver
 from palpate.errors import DriverError
+from ur_emulator import HOME, RTDE_PORT, UrController, ur5e
 
 pytest.importorskip("rtde_receive", reason="needs the extra ur; ur_rtde has no wheel for Python 3.13")
 
@@ -128,12 +128,12 @@ class TestCommanding:
         with UrDriver(ARM, HOST, mode="torque") as driver:
             driver.enable()
             assert ur.tell("state")["watchdog_ns"] == 100_000_000
-            sent = None
+            push = np.array([5.0, 0, 0, 0, 0, 0])
             for _ in range(100):
-                q = following(driver).position
-                sent = driver.write(ARM.gravity_torque(q) + [5.0, 0, 0, 0, 0, 0])
+                torque = ARM.gravity_torque(following(driver).position) + push
+                assert np.array_equal(driver.write(torque), torque)
             moved = following(driver)
-            assert sent is not None and moved.velocity is not None and moved.velocity[0] > 0.05
+            assert moved.velocity is not None and moved.velocity[0] > 0.05
             assert moved.position[0] > HOME[0]
             driver.disable()
             state = ur.tell("state")
@@ -159,7 +159,7 @@ class TestCommanding:
             assert ur.tell("state")["mode"] == "hold"
 
     def test_servo(self, ur: UrController) -> None:
-        goal = HOME + [0.05, 0, 0, 0, 0, 0.05]
+        goal = HOME + np.array([0.05, 0, 0, 0, 0, 0.05])
         with UrDriver(ARM, HOST, mode="servo") as driver:
             driver.enable()
             for _ in range(200):
@@ -348,3 +348,22 @@ class TestRefusals:
     def test_nonsense(self, arm: Arm, options: dict[str, object], message: str) -> None:
         with pytest.raises(DriverError, match=message):
             UrDriver(arm, HOST, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_500_hz_for_half_a_minute(ur: UrController) -> None:
+    """Rate, losses and age of the samples while commanding; the figures are printed."""
+    ages: list[float] = []
+    with UrDriver(ARM, HOST, mode="speed", watchdog=0.5) as driver:
+        driver.enable()
+        first = following(driver)
+        while True:
+            sample = following(driver)
+            ages.append(time.monotonic() - sample.time_ns * 1e-9)  # the emulated controller shows this clock
+            if sample.time_ns - first.time_ns > 30e9:
+                break
+            driver.speed([0.02 * np.sin(sample.time_ns * 1e-9), 0, 0, 0, 0, 0])
+        lost = driver.lost / (driver.lost + len(ages))
+    p50, p99 = np.percentile(ages, [50, 99]) * 1e3
+    print(f"RTDE 500 Hz: {len(ages)} samples, {lost:.2%} lost, age p50 {p50:.2f} ms, p99 {p99:.2f} ms")
+    assert lost < 0.1

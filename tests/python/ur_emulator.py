@@ -427,7 +427,7 @@ class Server:
 
 
 class UrController:
-    """Starts the emulated controller and talks with it: ``with UrController("127.0.5.1") as ur: ur.tell("protective")``.
+    """Starts the emulated controller and talks with it; a context manager.
 
     Args:
         host: loopback address it listens at.

@@ -24,6 +24,8 @@ _EXTRAS = {
     "sim": (("mujoco",), "simulated arms"),
     "report": (("matplotlib",), "reports and pictures"),
     "logs": (("rosbags", "lz4"), "compressed bags, any ROS 2 message"),
+    "ur": (("rtde_control", "rtde_receive"), "Universal Robots arms (Python up to 3.12)"),
+    "fri": (("google.protobuf",), "KUKA LBR arms by FRI"),
     "xacro": (("xacro",), "arms from .xacro files"),
     "data": (("pooch",), "palpate data get"),
     "vision": (("cv2",), "whiteboards in pictures"),
@@ -121,8 +123,15 @@ def _core() -> Finding:
     )
 
 
+def _found(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # the package that the module would be in
+        return False
+
+
 def _extra(name: str, modules: tuple[str, ...], use: str) -> Finding:
-    missing = [m for m in modules if importlib.util.find_spec(m) is None]
+    missing = [m for m in modules if not _found(m)]
     if missing:
         return Finding(
             f"extra {name}", False, f"no {', '.join(missing)}: {use}", f'pip install "palpate[{name}]"'

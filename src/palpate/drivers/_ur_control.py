@@ -10,13 +10,15 @@ from __future__ import annotations
 import json
 import os
 import sys
+from typing import Any
 
 
 def main() -> None:
     """Serve until the input ends."""
     replies = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # the client prints on standard output
-    control = None
+    control: Any = None
+    answer: list[Any]
     for line in sys.stdin:
         verb, arguments = json.loads(line)
         try:
