@@ -289,6 +289,22 @@ class TestLoss:
             ur.tell(mend)
             driver.close()
 
+    def test_when_ur_rtde_ends_the_watchdog_stops_the_arm(self, ur: UrController) -> None:
+        with UrDriver(ARM, HOST, mode="speed") as driver:
+            driver.enable()
+            following(driver)
+            driver.speed([0.3, 0, 0, 0, 0, 0])
+            driver._control.end()
+            following(driver)
+            with pytest.raises(DriverError, match="no answer by way of ur_rtde"):
+                driver.speed([0.3, 0, 0, 0, 0, 0])
+            assert driver.state == "connected"
+            until(lambda: not ur.tell("state")["program"])
+            assert ur.tell("state")["mode"] == "hold"
+            driver.enable()
+            following(driver)
+            driver.speed(np.zeros(6))
+
     def test_a_short_gap_is_none_and_counted(self, ur: UrController) -> None:
         with UrDriver(ARM, HOST) as driver:
             following(driver)

@@ -102,7 +102,7 @@ class Robot:
         self.plant = Plant(self.arm, integrator="discrete", timestep=2e-3)
         self.rate, self.version = rate, version
         self.period_ns = round(1e9 / rate)
-        self.plant.reset(HOME, time_ns=time.monotonic_ns())
+        self.plant.reset(HOME)
         self.gain = self.arm.effort.gain(6)
         self.hold, self.speed = HOME.copy(), np.zeros(6)
         self.mode = "hold"
@@ -398,7 +398,9 @@ class Server:
 
     def run(self) -> None:
         period = self.robot.period_ns * 1e-9
-        due = time.monotonic() + period
+        start_ns = time.monotonic_ns()
+        self.robot.plant.reset(HOME, time_ns=start_ns)
+        due = start_ns * 1e-9 + period  # so that a stamp less this clock is the age of a package
         while True:
             for key, _ in self.select.select(max(0.0, due - time.monotonic())):
                 sock: Any = key.fileobj

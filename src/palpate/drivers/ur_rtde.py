@@ -327,7 +327,7 @@ class UrDriver(Driver):
         hindrance = self._hindrance()
         if hindrance:
             raise DriverError(f"enable(): {hindrance}; clear that on the pendant first")
-        if self._control is None:
+        if self._control is None or self._control.ended:
             self._control = _Control(self._host, self._frequency)
         else:
             self._control.call("reuploadScript")
@@ -368,37 +368,29 @@ class UrDriver(Driver):
 
     def _disable(self) -> None:
         control = self._control
-        if control is None:
-            return
+        if control is None or control.ended:
+            return  # without commands the controller's watchdog stops the arm
         silent = self._receive.getTimestamp() == self._stamp
         if silent and time.monotonic() - self._arrived > self._watchdog:
-            # nobody hears a command; the controller's watchdog stops the arm
-            self._control = None
-            control.kill()
+            control.end()  # nobody hears a command: the watchdog again
             return
         if not self._receive.getRobotStatus() & _PROGRAM:
             return
-        try:
-            if self._mode == "speed":
-                control.call("speedStop", _DECELERATION)
-            elif self._mode == "servo":
-                control.call("servoStop", _DECELERATION)
-            elif self._mode == "force":
-                control.call("forceModeStop")
-            else:
-                control.call("stopJ", _DECELERATION)
-            control.call("stopScript")
-        except DriverError:
-            # without commands the controller's watchdog stops the arm
-            self._control = None
-            control.kill()
-            raise
+        if self._mode == "speed":
+            control.call("speedStop", _DECELERATION)
+        elif self._mode == "servo":
+            control.call("servoStop", _DECELERATION)
+        elif self._mode == "force":
+            control.call("forceModeStop")
+        else:
+            control.call("stopJ", _DECELERATION)
+        control.call("stopScript")
 
     def _close(self) -> None:
         control, receive = self._control, self._receive
         self._control = self._receive = None
         if control is not None:
-            control.kill()
+            control.end()
         if receive is not None:
             receive.disconnect()
 
@@ -418,32 +410,36 @@ class _Control:
             stdout=subprocess.PIPE,
         )
         try:
-            self.call("connect", patience=_START_S)
+            self.call("connect", patience=2.0 * _START_S)
         except DriverError:
-            self.kill()
+            self.end()
             raise
 
+    @property
+    def ended(self) -> bool:
+        """True when no call is possible any more."""
+        return self._process.poll() is not None
+
     def call(self, verb: str, *arguments: Any, patience: float = _CONNECT_S) -> Any:
-        """What the client's `verb` returns; an error if it has not returned after `patience` seconds."""
+        """What the client's `verb` returns; without an answer within `patience` seconds the client is ended."""
         stdin, stdout = self._process.stdin, self._process.stdout
         assert stdin is not None and stdout is not None  # pipes were asked for
-        try:
-            stdin.write(json.dumps([verb, arguments]).encode() + b"\n")
-            stdin.flush()
-            ready, _, _ = select.select([stdout], [], [], patience)
-            line = stdout.readline() if ready else None
-        except OSError as error:
-            raise DriverError(f"{verb}: ur_rtde has ended ({error})") from None
-        if line is None:
-            raise DriverError(f"{verb}: no answer from {self._host} within {patience:g} s")
+        line = b""
+        if not self.ended:
+            with contextlib.suppress(BrokenPipeError):  # it ended just now: there is no line
+                stdin.write(json.dumps([verb, arguments]).encode() + b"\n")
+                stdin.flush()
+                ready, _, _ = select.select([stdout], [], [], patience)
+                line = stdout.readline() if ready else b""
         if not line:
-            raise DriverError(f"{verb}: ur_rtde has ended")
+            self.end()
+            raise DriverError(f"{verb}: no answer by way of ur_rtde from {self._host} within {patience:g} s")
         answer, *complaint = json.loads(line)
         if complaint:
             raise DriverError(f"{verb}: {self._host}: {' '.join(complaint[0].split())}")
         return answer
 
-    def kill(self) -> None:
+    def end(self) -> None:
         """End the client now; its connections are closed by that."""
         self._process.kill()
         self._process.wait()
