@@ -466,4 +466,5 @@ def test_two_milliseconds_for_a_minute(loss: float) -> None:
         f"FRI 2 ms, {loss:.0%} lost each way: {seen['cycles']} cycles, {seen['missed']} without an answer in time, "
         f"{lost} not seen, {late} late, session ended {ended} times; a command takes {p50:.0f} us, p99.9 {p999:.0f} us"
     )
-    assert ended == seen["fell_back"] and len(answers) > 0.9 * seen["cycles"]
+    assert 0 <= seen["fell_back"] - ended <= 1  # the last one may come after the last sample
+    assert len(answers) > 0.9 * seen["cycles"]

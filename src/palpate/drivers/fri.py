@@ -378,6 +378,8 @@ class FriDriver(Driver):
         robot = self._monitoring.robot
         if robot.safety_state != 0:
             return f"the controller reports: {self.session}"
+        if self._monitoring.connection.session_state < _COMMANDING_WAIT:
+            return ""  # the robot program may switch the drives on later
         idle = [i for i, drive in enumerate(robot.drive_state) if _name(_DRIVES, drive) != "ACTIVE"]
         if idle:
             return (
