@@ -19,7 +19,7 @@ from palpate.arm import Arm
 from palpate.drivers import Driver, Sample
 from palpate.drivers.fri import FriDriver
 from palpate.drivers.laws import DriverLaws
-from palpate.errors import DriverError
+from palpate.errors import DriverError, MissingExtraError
 from palpate.simulate import Plant
 
 PORT = 30207
@@ -401,6 +401,11 @@ class TestHostile:
 
 
 class TestRefusals:
+    def test_without_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "google.protobuf", None)
+        with pytest.raises(MissingExtraError, match=r"palpate\[fri\]"):
+            make()
+
     def test_nobody_sends(self) -> None:
         with pytest.raises(DriverError, match=f"no monitoring message came to {LOCAL}:{PORT} within 0.1 s"):
             make(patience=0.1).connect()

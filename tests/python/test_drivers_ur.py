@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ from palpate.arm import Arm, Array, Effort
 from palpate.drivers import Driver, Sample
 from palpate.drivers.laws import DriverLaws
 from palpate.drivers.ur_rtde import UrDriver
-from palpate.errors import DriverError
+from palpate.errors import DriverError, MissingExtraError
 from ur_emulator import HOME, RTDE_PORT, UrController, ur5e
 
 pytest.importorskip("rtde_receive", reason="needs the extra ur; ur_rtde has no wheel for Python 3.13")
@@ -319,6 +320,11 @@ class TestLoss:
 
 
 class TestRefusals:
+    def test_without_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "rtde_receive", None)
+        with pytest.raises(MissingExtraError, match=r"palpate\[ur\]"):
+            UrDriver(ARM, "127.0.5.9").connect()
+
     def test_nobody_there(self) -> None:
         with pytest.raises(DriverError, match="connect.*127.0.5.9:30004.*no UR controller"):
             UrDriver(ARM, "127.0.5.9").connect()
