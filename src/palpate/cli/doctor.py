@@ -26,6 +26,8 @@ _EXTRAS = {
     "logs": (("rosbags", "lz4"), "compressed bags, any ROS 2 message"),
     "dynamixel": (("dynamixel_sdk",), "arms of Dynamixel servos"),
     "feetech": (("scservo_sdk",), "arms of Feetech servos"),
+    "ur": (("rtde_control", "rtde_receive"), "Universal Robots arms (Python up to 3.12)"),
+    "fri": (("google.protobuf",), "KUKA LBR arms by FRI"),
     "xacro": (("xacro",), "arms from .xacro files"),
     "data": (("pooch",), "palpate data get"),
     "vision": (("cv2",), "whiteboards in pictures"),
@@ -124,8 +126,15 @@ def _core() -> Finding:
     )
 
 
+def _found(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # the package that the module would be in
+        return False
+
+
 def _extra(name: str, modules: tuple[str, ...], use: str) -> Finding:
-    missing = [m for m in modules if importlib.util.find_spec(m) is None]
+    missing = [m for m in modules if not _found(m)]
     if missing:
         return Finding(
             f"extra {name}", False, f"no {', '.join(missing)}: {use}", f'pip install "palpate[{name}]"'

@@ -12,6 +12,7 @@ import logging
 import math
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from types import TracebackType
 from typing import Literal, Self, TypeAlias
 
@@ -127,30 +128,48 @@ class Driver(ABC):
         Raises:
             DriverError: not enabled; the shape is wrong; a number is NaN or infinite.
         """
+        return self._checked("write()", "torque", "N m", torque, self._joint_names, self._write)
+
+    def _checked(
+        self,
+        verb: str,
+        what: str,
+        unit: str,
+        values: npt.ArrayLike,
+        names: tuple[str, ...],
+        send: Callable[[Array], Array],
+    ) -> Array:
+        """Check a command of one number per name, send it, return what was sent; on failure stop the drives.
+
+        Drivers that take more than torque check their other commands by it too.
+        """
         if self._state != "enabled":
             reason = f"; the drives were stopped: {self._stopped_by}" if self._stopped_by else ""
-            raise DriverError(f"write() needs enable() first: the driver is {self._state}{reason}")
+            raise DriverError(f"{verb} needs enable() first: the driver is {self._state}{reason}")
         complaint = ""
         try:
-            command = np.array(torque, dtype=np.float64)
+            command = np.array(values, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
-            complaint = f"torque must be {self.n} numbers [N m], got {torque!r:.80}"
+            complaint = f"{what} must be {len(names)} numbers [{unit}], got {values!r:.80}"
         else:
-            if command.shape != (self.n,):
-                complaint = f"torque must have shape ({self.n},), got {command.shape}"
+            if command.shape != (len(names),):
+                complaint = f"{what} must have shape ({len(names)},), got {command.shape}"
             elif not np.isfinite(command).all():
                 bad = int(np.flatnonzero(~np.isfinite(command))[0])
-                complaint = f"torque of joint {self._joint_names[bad]!r} is {command[bad]!s}"
+                complaint = f"{what} of {names[bad]!r} is {command[bad]!s}"
         if complaint:
-            self.stop()
-            self._stopped_by = complaint
-            raise DriverError(f"write(): {complaint}; the drives were stopped")
+            self._stop_because(complaint)
+            raise DriverError(f"{verb}: {complaint}; the drives were stopped")
         try:
-            return self._write(command)
+            return send(command)
         except Exception as error:
-            self.stop()
-            self._stopped_by = f"a command could not be sent ({error})"
+            self._stop_because(f"a command could not be sent ({error})")
             raise
+
+    def _stop_because(self, reason: str) -> None:
+        """Stop the drives; the next command's error says why."""
+        self.stop()
+        self._stopped_by = reason
 
     def enable(self) -> None:
         """Switch the drives on, at the safe torque. Enabled already: nothing happens.

@@ -1,0 +1,475 @@
+"""The FRI driver against an emulated controller: lost, late, doubled, hostile packets. No real one was at hand."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import fri_emulator
+import palpate as pp
+from fri_emulator import ACTIVE, ARM, HOME, FriController, Network, block, doubles, fields, number
+from palpate.arm import Arm
+from palpate.drivers import Driver, Sample
+from palpate.drivers.fri import FriDriver
+from palpate.drivers.laws import DriverLaws
+from palpate.errors import DriverError, MissingExtraError
+from palpate.simulate import Plant
+
+PORT = 30207
+LOCAL = "127.0.0.1"
+
+
+def until(what: Callable[[], bool], seconds: float = 5.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < deadline, "it did not happen"
+
+
+def following(driver: Driver) -> Sample:
+    for _ in range(100):
+        sample = driver.read()
+        if sample is not None:
+            return sample
+    raise AssertionError("no sample")
+
+
+def make(**options: object) -> FriDriver:
+    return FriDriver(ARM, **{"port": PORT, "address": LOCAL} | options)  # type: ignore[arg-type]
+
+
+class TestFriLaws(DriverLaws):
+    @pytest.fixture(autouse=True)
+    def controller(self) -> object:
+        with FriController(PORT) as controller:
+            yield controller
+
+    def make(self) -> Driver:
+        return make(mode="torque")
+
+
+class TestFriLawsOnABadNetwork(TestFriLaws):
+    """The same where messages are late, doubled and lost; what was sent need not be what acts."""
+
+    periods = 60
+    effort_tolerance = 1e3
+
+    @pytest.fixture(autouse=True)
+    def controller(self) -> object:
+        with FriController(PORT, network=Network(loss=0.02, delay=0.02, double=0.05, seed=4)) as controller:
+            yield controller
+
+
+@pytest.mark.parametrize("layout", ["1.15", "2.5"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_samples_are_the_arms(layout: str, packed: bool) -> None:
+    with FriController(PORT, layout=layout, packed=packed, commanding=False) as controller, make() as driver:
+        samples = [following(driver) for _ in range(30)]
+        assert np.array_equal(np.diff([s.time_ns for s in samples]), np.full(29, 2_000_000))
+        np.testing.assert_allclose(samples[-1].position, HOME, atol=1e-3)
+        np.testing.assert_allclose(samples[-1].effort, ARM.gravity_torque(samples[-1].position), atol=0.5)
+        assert samples[-1].velocity is None and driver.effort.kind == "torque"
+        assert driver.external.shape == (7,) and driver.session.endswith("NORMAL")
+        assert controller.missed <= 1 and controller.stale == 0
+
+
+def test_every_message_is_answered_and_reflected() -> None:
+    with FriController(PORT, commanding=False) as controller, make() as driver:
+        for _ in range(50):
+            following(driver)
+        commands = controller.commands[:40]
+        assert np.all(np.diff([c.reflected for c in commands]) == 1)
+        assert np.all(np.diff([c.sequence for c in commands]) == 1)
+        assert all(c.position is None for c in commands), "monitoring answers command nothing"
+
+
+def test_every_third_message_where_the_program_says_so() -> None:
+    with FriController(PORT, multiplier=3, commanding=False) as controller, make(mode="torque") as driver:
+        for _ in range(60):
+            following(driver)
+        assert controller.missed <= 1
+        assert np.all(np.diff([c.reflected for c in controller.commands[1:15]]) == 3)
+        with pytest.raises(DriverError, match="receive multiplier to 3"):
+            driver.enable()
+
+
+def test_the_sign_of_torque() -> None:
+    with FriController(PORT, commanding=False), make(torque_sign=-1) as driver:
+        sample = following(driver)
+        np.testing.assert_allclose(sample.effort, -ARM.gravity_torque(sample.position), atol=0.5)
+
+
+class TestTorque:
+    def test_what_was_sent_moves_the_arm(self) -> None:
+        """A second plant, fed with the samples' effort alone, goes the same way; 3 N m more than gravity move it."""
+        twin = Plant(ARM, integrator="discrete", timestep=2e-3)
+        with FriController(PORT) as controller, make(mode="torque") as driver:
+            driver.enable()
+            sample = following(driver)
+            twin.reset(sample.position)
+            push = np.array([0, 3.0, 0, 0, 0, 0, 0])
+            rows = []
+            for _ in range(50):
+                driver.write(ARM.gravity_torque(sample.position) + push)
+                sample = following(driver)
+                rows.append(sample)
+            for row in rows:
+                twin.step(row.effort, 2_000_000)
+            np.testing.assert_allclose(twin.q, rows[-1].position, atol=1e-5)
+            assert rows[-1].position[1] > rows[0].position[1] + 5e-3
+            assert controller.stale == 0
+
+    def test_a_held_object_is_felt(self) -> None:
+        """1.5 kg at the tip, the arm held by its controller: the external torque is its weight, within 1 %."""
+        controller = FriController(PORT, commanding=False)
+        controller.plant.attach(1.5)
+        pipeline = pp.Pipeline(ARM, observer=pp.InverseDynamicsObserver())
+        with controller, make() as driver:
+            for _ in range(500):
+                touch = pipeline.step(sample := following(driver))
+        weight = ARM.jacobian(sample.position).T @ np.array([0, 0, -1.5 * 9.81, 0, 0, 0])
+        assert np.linalg.norm(touch.external.torque - weight) < 0.01 * np.linalg.norm(weight)
+
+    def test_clamped_to_the_arms_limits(self) -> None:
+        with FriController(PORT), make(mode="torque") as driver:
+            driver.enable()
+            limit = [j.limits.effort for j in ARM.joints]
+            assert np.array_equal(driver.write(np.full(7, 1e9)), limit)
+
+    def test_one_answer_per_message(self) -> None:
+        """A second command in the same period is not sent, and write() says what is."""
+        with FriController(PORT) as controller, make(mode="torque") as driver:
+            driver.enable()
+            following(driver)
+            sent = driver.write(np.full(7, 0.5))
+            assert np.array_equal(driver.write(np.full(7, -0.5)), sent)
+            following(driver)
+            reflected = [c.reflected for c in controller.commands]
+            assert len(set(reflected)) == len(reflected)
+
+    def test_a_message_that_nobody_commanded_is_answered_without_torque(self) -> None:
+        with FriController(PORT) as controller, make(mode="torque") as driver:
+            driver.enable()
+            for _ in range(5):
+                following(driver)
+                driver.write(np.zeros(7))
+            for _ in range(5):
+                following(driver)
+            assert all(c.torque is not None and not c.torque.any() for c in controller.commands[-4:])
+            assert controller.state == ACTIVE
+
+    def test_stop_answers_at_once_and_the_session_stays(self) -> None:
+        with FriController(PORT) as controller, make(mode="torque") as driver:
+            driver.enable()
+            following(driver)
+            driver.stop()
+            for _ in range(60):
+                following(driver)
+            assert controller.state == ACTIVE and controller.fell_back == 0
+            driver.enable()
+
+
+def test_position() -> None:
+    goal = HOME + 0.02
+    with (
+        FriController(PORT, mode="position", period=0.01) as controller,
+        make(mode="position", period=0.01) as driver,
+    ):
+        driver.enable()
+        for _ in range(60):
+            following(driver)
+            assert np.array_equal(driver.position(goal), goal)
+        np.testing.assert_allclose(following(driver).position, goal, atol=2e-3)
+        with pytest.raises(DriverError, match=r"takes no torque; call position\(\)"):
+            driver.write(np.zeros(7))
+        assert driver.state == "connected" and controller.stale == 0
+
+
+def test_wrench() -> None:
+    """20 N along the tool's z move the tool that way."""
+    with FriController(PORT, mode="wrench"), make(mode="wrench") as driver:
+        driver.enable()
+        start = ARM.forward_kinematics(following(driver).position)
+        for _ in range(50):
+            driver.wrench([0, 0, 20.0, 0, 0, 0])
+            sample = following(driver)
+        moved = start[:3, :3].T @ (ARM.forward_kinematics(sample.position)[:3, 3] - start[:3, 3])
+        assert moved[2] > 2e-3
+        with pytest.raises(DriverError, match="wrench of 'Fy' is nan"):
+            driver.wrench([0, np.nan, 0, 0, 0, 0])
+
+
+class TestSession:
+    def test_the_robot_program_must_fit(self) -> None:
+        with FriController(PORT, mode="wrench"), make(mode="torque") as driver:
+            with pytest.raises(DriverError, match="expects WRENCH, this driver commands TORQUE"):
+                driver.enable()
+            assert driver.state == "connected"
+
+    def test_the_control_mode_must_fit(self) -> None:
+        controller = FriController(PORT, mode="torque")
+        controller.control_mode = 0
+        with controller, make(mode="torque") as driver:
+            with pytest.raises(
+                DriverError, match="needs the control mode JOINT_IMPEDANCE, the robot is in POSITION"
+            ):
+                driver.enable()
+
+    def test_monitoring_only(self) -> None:
+        with FriController(PORT), make() as driver:
+            with pytest.raises(DriverError, match="monitors.*'torque', 'position', 'wrench'"):
+                driver.enable()
+
+    def test_a_safety_stop_ends_control_and_is_named(self) -> None:
+        with FriController(PORT) as controller, make(mode="torque") as driver:
+            driver.enable()
+            following(driver)
+            driver.write(np.zeros(7))
+            controller.safety = 2
+            until(lambda: following(driver) is not None and driver.state == "connected")
+            with pytest.raises(DriverError, match="stopped.*STOP_1"):
+                driver.write(np.zeros(7))
+            with pytest.raises(DriverError, match="STOP_1"):
+                driver.enable()
+            controller.safety = 0
+            until(lambda: following(driver) is not None and "NORMAL" in driver.session)
+            driver.enable()
+
+    def test_drives_that_are_off_are_named(self) -> None:
+        controller = FriController(PORT)
+        controller.drive = 0
+        with controller, make(mode="torque") as driver:
+            with pytest.raises(DriverError, match="the drive of 'A1' is OFF"):
+                driver.enable()
+
+    def test_the_program_ends_its_motion(self) -> None:
+        with FriController(PORT) as controller, make(mode="torque") as driver:
+            driver.enable()
+            controller.commanding = False
+            until(lambda: following(driver) is not None and driver.state == "connected")
+            with pytest.raises(DriverError, match="fell back: MONITORING_READY"):
+                driver.write(np.zeros(7))
+
+    def test_a_client_that_sleeps_loses_the_session(self) -> None:
+        with FriController(PORT, realtime=True) as controller, make(mode="torque", patience=5.0) as driver:
+            driver.enable()
+            time.sleep(0.3)
+            assert controller.fell_back == 1
+            until(lambda: following(driver) is not None and driver.state == "connected")
+            assert driver.lost > 50
+            driver.enable()
+
+    def test_another_period_is_named(self) -> None:
+        with FriController(PORT, period=0.005):
+            with pytest.raises(DriverError, match="every 5 ms.*made for 2 ms: give period=0.005"):
+                make().connect()
+
+
+class TestNetwork:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_one_percent_lost_the_session_stays_and_nothing_is_stale(self, seed: int) -> None:
+        """Lost, late and doubled packets: times rise, losses are counted, no answer is for an old message."""
+        network = Network(loss=0.01, delay=0.01, double=0.02, seed=seed)
+        with FriController(PORT, network=network) as controller, make(mode="torque") as driver:
+            driver.enable()
+            stamps = []
+            for _ in range(1000):
+                sample = driver.read()
+                if sample is not None:
+                    stamps.append(sample.time_ns)
+                    driver.write(ARM.gravity_torque(sample.position))
+            steps = np.diff(stamps) // 2_000_000
+            assert np.all(steps >= 1) and len(stamps) > 950
+            assert driver.lost >= steps.sum() - len(steps) > 0
+            assert driver.refused > 0
+            assert controller.stale == 0
+            assert driver.state == "enabled" and controller.fell_back == 0
+
+    def test_a_bad_network_ends_control_by_the_rules(self) -> None:
+        controller = FriController(PORT)
+        with controller, make(mode="torque") as driver:
+            driver.enable()
+            controller.network = Network(loss=0.3, seed=1)
+            until(lambda: driver.read() is None or driver.state == "connected", 20.0)
+            until(lambda: driver.read() is not None and driver.state == "connected", 20.0)
+            assert controller.fell_back >= 1
+            with pytest.raises(DriverError, match="fell back"):
+                driver.write(np.zeros(7))
+
+    def test_the_same_seed_gives_the_same_run(self) -> None:
+        runs = []
+        for _ in range(2):
+            network = Network(loss=0.01, delay=0.01, double=0.02, seed=7)
+            with FriController(PORT, network=network), make(mode="torque") as driver:
+                driver.enable()
+                rows: list[np.ndarray] = []
+                while len(rows) < 200:
+                    rows.append(following(driver).position)
+                    driver.write(ARM.gravity_torque(rows[-1]) + np.sin(0.1 * len(rows)))
+                runs.append(np.array(rows))
+        assert np.array_equal(*runs) and np.all(np.ptp(runs[0], axis=0) > 1e-3)
+
+    def test_silence_is_none_then_an_error(self) -> None:
+        with FriController(PORT) as controller, make(mode="torque", patience=0.2) as driver:
+            driver.enable()
+            following(driver)
+            controller.paused = True
+            until(lambda: driver.read() is None)
+            begin = time.monotonic()
+            with pytest.raises(DriverError, match="no monitoring message for 0.2"):
+                while True:
+                    driver.read()
+            assert time.monotonic() - begin < 1.0 and driver.state == "connected"
+            with pytest.raises(DriverError, match=r"enable\(\) first"):
+                driver.write(np.zeros(7))
+            driver.close()
+            controller.paused = False
+            driver.connect()
+            driver.enable()
+
+    def test_a_new_session_counts_from_zero(self) -> None:
+        with FriController(PORT, commanding=False) as controller, make() as driver:
+            for _ in range(30):
+                following(driver)
+            controller.sequence = 0
+            for _ in range(10):
+                following(driver)
+            assert driver.lost == 0 and driver.refused == 0
+
+
+class TestHostile:
+    def refuse(self, change: Callable[[bytes], bytes]) -> None:
+        """Changed messages are passed over and counted, and the session goes on when they end."""
+        with FriController(PORT, commanding=False) as controller, make(patience=5.0) as driver:
+            following(driver)
+            before = driver.refused
+            controller.before_send = change
+            until(lambda: driver.read() is None and driver.refused > before + 1)
+            controller.before_send = lambda data: data
+            following(driver)
+
+    def test_noise(self) -> None:
+        rng = np.random.default_rng(0)
+        self.refuse(lambda data: rng.bytes(rng.integers(0, 1400)))
+
+    def test_cut_short(self) -> None:
+        self.refuse(lambda data: data[: len(data) // 2])
+
+    def test_too_long(self) -> None:
+        self.refuse(lambda data: data + block(14, bytes(2000)))
+
+    def test_another_message(self) -> None:
+        self.refuse(lambda data: data.replace(b"\x42\x51\x24\x00", b"\x43\x51\x24\x00"))
+
+    @pytest.mark.parametrize("values", [np.full(7, np.nan), np.zeros(6), np.zeros(0), np.full(7, np.inf)])
+    def test_positions_that_are_none(self, values: np.ndarray) -> None:
+        def change(data: bytes) -> bytes:
+            parts = fields(data)
+            monitor = fields(parts[3][0])
+            rest = b"".join(block(t, v) for t in (2, 5, 15) for v in monitor[t])
+            return b"".join(
+                block(t, doubles(1, values) + rest if t == 3 else v) for t, (v, *_) in parts.items()
+            )
+
+        self.refuse(change)
+
+    def test_an_old_message_again_and_again(self) -> None:
+        kept: list[bytes] = []
+
+        def change(data: bytes) -> bytes:
+            kept.append(data)
+            return kept[0]
+
+        self.refuse(change)
+
+    def test_another_sender_is_not_heard(self) -> None:
+        with FriController(PORT, commanding=False) as controller, make() as driver:
+            following(driver)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+                other.bind(("127.0.0.7", 0))
+                future = controller.monitoring().replace(block(15, number(1, 1)), block(15, number(1, 2**31)))
+                for _ in range(20):
+                    other.sendto(future, controller.client)
+            stamps = [following(driver).time_ns for _ in range(30)]
+            assert driver.refused == 20 and np.all(np.diff(stamps) == 2_000_000)
+
+
+class TestRefusals:
+    def test_without_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "google.protobuf", None)
+        with pytest.raises(MissingExtraError, match=r"palpate\[fri\]"):
+            make()
+
+    def test_nobody_sends(self) -> None:
+        with pytest.raises(DriverError, match=f"no monitoring message came to {LOCAL}:{PORT} within 0.1 s"):
+            make(patience=0.1).connect()
+
+    def test_only_the_named_controller_is_heard(self) -> None:
+        with FriController(PORT, commanding=False):
+            with pytest.raises(DriverError, match="datagrams of another kind"):
+                make(controller="127.0.0.9", patience=0.3).connect()
+            with make(controller=LOCAL) as driver:
+                following(driver)
+
+    def test_the_port_is_taken(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            other.bind((LOCAL, PORT))
+            with pytest.raises(DriverError, match=f"cannot listen at {LOCAL}:{PORT}"):
+                make().connect()
+
+    def test_an_arm_of_other_joints(self) -> None:
+        six = Arm.from_dh([0] * 6, [0] * 6, [0] * 6)
+        with FriController(PORT, commanding=False):
+            with pytest.raises(DriverError, match="of another kind"):
+                FriDriver(six, port=PORT, address=LOCAL, patience=0.3).connect()
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"mode": "force"}, "mode must be None, 'torque'"),
+            ({"period": 0.5}, "period"),
+            ({"port": 80}, "30200 to 30209"),
+            ({"torque_sign": 0}, "torque_sign"),
+            ({"patience": float("nan")}, "patience"),
+        ],
+    )
+    def test_nonsense(self, options: dict[str, object], message: str) -> None:
+        with pytest.raises(DriverError, match=message):
+            make(**options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", [0.0, 0.01])
+def test_two_milliseconds_for_a_minute(loss: float) -> None:
+    """A wrench overlay in real time, the controller in a process of its own; the figures are printed."""
+    run = [sys.executable, fri_emulator.__file__, str(PORT), "60", str(loss)]
+    answers, ended = [], 0
+    with subprocess.Popen(run, stdout=subprocess.PIPE, text=True) as process:
+        with make(mode="wrench", patience=3.0) as driver:
+            driver.enable()
+            with pytest.raises(DriverError, match="the session is over"):
+                while True:
+                    sample = driver.read()
+                    begin = time.monotonic()
+                    if driver.state != "enabled":
+                        ended += 1
+                        driver.enable()
+                    elif sample is not None:
+                        driver.wrench([0, 0, 0.1 * np.sin(sample.time_ns * 1e-9), 0, 0, 0])
+                        answers.append(time.monotonic() - begin)
+            late, lost = driver.late, driver.lost
+        assert process.stdout is not None
+        seen = json.loads(process.stdout.read())
+    p50, p999 = np.percentile(answers, [50, 99.9]) * 1e6
+    print(
+        f"FRI 2 ms, {loss:.0%} lost each way: {seen['cycles']} cycles, {seen['missed']} without an answer in time, "
+        f"{lost} not seen, {late} late, session ended {ended} times; a command takes {p50:.0f} us, p99.9 {p999:.0f} us"
+    )
+    assert 0 <= seen["fell_back"] - ended <= 1  # the last one may come after the last sample
+    assert len(answers) > 0.9 * seen["cycles"]
