@@ -290,8 +290,8 @@ def _cover(
             lines += best[1]
             wiped = best[2]
         remaining = remaining.difference(wiped.buffer(_HAIR, join_style="mitre"))
-    # patches that touch are one place
-    return lines, shapely.union_all([p.buffer(2.0 * _HAIR) for p in left])
+    # patches that touch are one place; crumbs are too small for a stroke of their own, and told all the same
+    return lines, shapely.union_all([p.buffer(2.0 * _HAIR) for p in (*left, remaining) if not p.is_empty])
 
 
 def _strips(
