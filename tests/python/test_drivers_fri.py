@@ -472,4 +472,4 @@ def test_two_milliseconds_for_a_minute(loss: float) -> None:
         f"{lost} not seen, {late} late, session ended {ended} times; a command takes {p50:.0f} us, p99.9 {p999:.0f} us"
     )
     assert 0 <= seen["fell_back"] - ended <= 1  # the last one may come after the last sample
-    assert answers  # how many is the machine's matter: printed, not judged
+    assert len(answers) > 0  # how many is the machine's matter: printed, not judged
