@@ -119,7 +119,7 @@ Vector Dynamics::forward_derivatives(const Vector& q, const Vector& dq, const Ve
 }
 void Dynamics::carry(const palpate::Inertia<double>& load) {
   p_->model.inertias[N] = p_->own;
-  if (load.m > 0.0) p_->model.inertias[N] += inertia(load);
+  if (load.m != 0.0) p_->model.inertias[N] += inertia(load);
 }
 Vector Dynamics::bias_torque(const palpate::Inertia<double>& body, const Vector& q, const Vector& dq) {
   const Data& data = p_->data;

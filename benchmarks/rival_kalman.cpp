@@ -117,33 +117,45 @@ class JointKalman {
   }
 
   using Update = typename palpate::JointKalman<max_parameters>::Update;
+  Update measure(int i, int e, double z, double R) {
+    Update update{};
+    with_sizes([&](auto loads, auto torques, auto encoders) {
+      update = measure_upper<2 * N + loads + (torques ? N : 0) + (encoders ? N : 0)>(i, e, z, R);
+    });
+    return update;
+  }
   template <class Seen>
   void measure_joints(const palpate::Arm& arm, const palpate::JointSample& s, Seen&& seen) {
     with_sizes([&](auto loads, auto torques, auto encoders) {
       constexpr int D = 2 * N + loads + (torques ? N : 0) + (encoders ? N : 0);
-      using State = Eigen::Matrix<double, D, 1>;
-      Eigen::Map<State> x(x_.data()), K(K_.data());
-      Eigen::Map<Eigen::Matrix<double, D, D>> P(P_.data());  // the upper triangle is valid
       for (int i = 0; i < N; ++i) {
         const int e = encoders ? D - N + i : -1;
-        State p = column<D>(P, i);
-        double y = s.q[u(i)] - x[i];
-        if constexpr (encoders) {
-          p += column<D>(P, e);
-          y -= x[e];
-        }
-        const double S = p[i] + (encoders ? p[e] : 0.0) + std::max(arm.position_variance(i), least_variance);
-        K = p / S;
-        const State left = p - S * K;
-        for (int c = 0; c < D; ++c) P.col(c).head(c + 1) -= p[c] * K.head(c + 1) + K[c] * left.head(c + 1);
-        x += K * y;
-        seen(i, e, Update{y, S, K_.data()});
+        seen(i, e, measure_upper<D>(i, e, s.q[u(i)], std::max(arm.position_variance(i), least_variance)));
       }
     });
   }
 
  private:
   static constexpr double least_variance = 1e-16;
+
+  /// On the upper triangle of P.
+  template <int D>
+  Update measure_upper(int i, int e, double z, double R) {
+    Eigen::Map<Eigen::Matrix<double, D, 1>> x(x_.data()), K(K_.data());
+    Eigen::Map<Eigen::Matrix<double, D, D>> P(P_.data());
+    Eigen::Matrix<double, D, 1> p = column<D>(P, i);
+    double y = z - x[i];
+    if (e >= 0) {
+      p += column<D>(P, e);
+      y -= x[e];
+    }
+    const double S = p[i] + (e >= 0 ? p[e] : 0.0) + R;
+    K = p / S;
+    p /= std::sqrt(S);
+    for (int c = 0; c < D; ++c) P.col(c).head(c + 1) -= p[c] * p.head(c + 1);
+    x += K * y;
+    return {y, S, K_.data()};
+  }
 
   /// The sizes as constants: those that the benchmark's arms have.
   template <class F>
