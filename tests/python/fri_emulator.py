@@ -145,6 +145,7 @@ class FriController(threading.Thread):
         multiplier: every which message wants an answer.
         network: what happens on the way.
         realtime: a cycle lasts its period; False: until its answer has come.
+        wait: for an answer in lockstep at most [s].
         commanding: the robot program runs its overlay motion.
     """
 
@@ -158,6 +159,7 @@ class FriController(threading.Thread):
         multiplier: int = 1,
         network: Network | None = None,
         realtime: bool = False,
+        wait: float = 0.4,
         commanding: bool = True,
         packed: bool = False,
     ) -> None:
@@ -165,7 +167,7 @@ class FriController(threading.Thread):
         self.client = ("127.0.0.1", port)
         self.mode, self.layout, self.period = mode, layout, period
         self.multiplier, self.network = multiplier, network or Network()
-        self.realtime, self.commanding, self.packed = realtime, commanding, packed
+        self.realtime, self.wait, self.commanding, self.packed = realtime, wait, commanding, packed
         self.plant = Plant(ARM, integrator="discrete", timestep=period)
         self.plant.reset(HOME, time_ns=1_000_000_000)
         self.control_mode = CONTROL_MODES[mode]
@@ -274,7 +276,13 @@ class FriController(threading.Thread):
             self.answered.append(command is not None)
             self.missed += command is None
             self._session(command)
-        self.plant.step(self._drives(command), round(self.period * 1e9))
+        if self.commands:
+            self.plant.step(self._drives(command), round(self.period * 1e9))
+        else:  # the clock runs, the arm waits: its last digits must not tell how long
+            load = self.plant.load
+            self.plant.reset(HOME, time_ns=self.plant.time_ns + round(self.period * 1e9))
+            if load is not None:
+                self.plant.attach(load)
         self.ipo = self.hold.copy()
         self.sequence = (self.sequence + 1) % 2**32
         self.cycles += 1
@@ -288,7 +296,7 @@ class FriController(threading.Thread):
     def _await(self, due: float) -> Command | None:
         """The answer to this cycle's message, if it comes in time."""
         command = None
-        end = due if self.realtime else time.monotonic() + (0.4 if self.commands else 0.05)
+        end = due if self.realtime else time.monotonic() + (self.wait if self.commands else 0.05)
         while command is None and not self._over.is_set():
             self.socket.settimeout(min(max(1e-4, end - time.monotonic()), 0.05))
             try:

@@ -277,7 +277,7 @@ class TestMujocoDriver:
             start = time.monotonic()
             for _ in range(26):
                 driver.read()
-            assert 0.099 <= time.monotonic() - start < 1.0
+            assert time.monotonic() - start >= 0.099
 
     def test_current_unit(self) -> None:
         arm = ARM.replace(effort=Effort.current(k_t=0.1, gear=[50, 50, 50, 50, 50, -50, 50]))
@@ -351,7 +351,7 @@ class TestReplayDriver:
         with ReplayDriver(make_log(rows=21), pace=2.0) as driver:
             while not driver.finished:
                 driver.read()
-        assert 0.039 <= time.monotonic() - start < 1.0
+        assert time.monotonic() - start >= 0.039
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])

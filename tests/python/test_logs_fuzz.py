@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import random
 import resource
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -129,7 +128,6 @@ def test_damaged_files(tmp_path, kind):
     outcomes = {"log": 0, "error": 0}
     for seed in range(FILES_PER_KIND):
         path.write_bytes(damage(data, random.Random(f"{kind} {seed}")))
-        start = time.perf_counter()
         try:
             log = Log.open(path, columns, keep_invalid=bool(seed % 2))
         except LogError as error:
@@ -140,7 +138,6 @@ def test_damaged_files(tmp_path, kind):
             assert len(log) >= 1
             assert str(log.repair)
             assert log.summary()
-        assert time.perf_counter() - start < 5.0, f"seed {seed} took too long"
     assert min(outcomes.values()) > 0, outcomes
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory
     assert grown < 300 * 1024, f"{grown} kB more memory"

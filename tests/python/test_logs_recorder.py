@@ -419,21 +419,7 @@ def test_any_message_needs_its_extra(tmp_path, monkeypatch):
     assert len(Log.open(tmp_path / "run.mcap")) == 1
 
 
-# -- speed and death --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_recording_is_fast(tmp_path, storage):
-    z = np.random.default_rng(0).standard_normal((4000, 7))
-    best = 0.0
-    for attempt in range(5):  # the best of some: other programs run on this machine, too
-        with Recorder(tmp_path / f"run{attempt}", [f"j{k}" for k in range(7)], storage=storage) as recorder:
-            start = time.perf_counter()
-            for k, q in enumerate(z):
-                recorder.sample(k * 10**6, q, q, q, q)
-            recorder.flush()
-            best = max(best, len(z) / (time.perf_counter() - start))
-    assert best > 20_000.0
+# -- death -----------------------------------------------------------------------------------------------------------
 
 
 CHILD = """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import pickle
-import time
 import zipfile
 from decimal import Decimal
 from pathlib import Path
@@ -301,10 +300,8 @@ def test_a_last_line_without_end_is_noted(tmp_path):
     ids="empty blank comment header bad-time bad-cell widths utf16 mcap db3 zip one-line zeros".split(),
 )
 def test_files_that_are_no_table(tmp_path, text, message):
-    start = time.perf_counter()
     with pytest.raises(LogError, match=message):
         Log.open(write(tmp_path, text))
-    assert time.perf_counter() - start < 2.0
 
 
 def test_a_gzip_bomb_of_good_rows_is_refused(tmp_path, monkeypatch):
