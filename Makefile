@@ -13,19 +13,20 @@ endif
 
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet
-SOURCES := $(sort $(shell find src core/include core/src bindings cmake -type f \
+SOURCES := $(sort $(shell find src core/include core/src session/include bindings cmake -type f \
              -not -name '*.pyc' -not -name '_core.*' 2>/dev/null)) \
-           CMakeLists.txt core/CMakeLists.txt pyproject.toml README.md
+           CMakeLists.txt core/CMakeLists.txt session/CMakeLists.txt pyproject.toml README.md
 
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help demo test test-slow cpp-test cpp-package lint docs bench wheel sanitize format dev clean FORCE
+.PHONY: help demo test test-slow cpp-test cpp-package lint docs bench wheel sanitize sanitize-thread format dev clean FORCE
 
 help:
 	@echo "make demo        install into $(VENV) and weigh something in simulation"
 	@echo "make test        C++ tests, lint, types, layers, docs, wheel, Python tests"
 	@echo "make test-slow   the tests that take minutes"
-	@echo "make cpp-test    only the C++ tests;  make sanitize: the same under ASan and UBSan"
+	@echo "make cpp-test    only the C++ tests;  make sanitize: the same under ASan and UBSan;"
+	@echo "                 make sanitize-thread: those of the session under TSan"
 	@echo "make lint        ruff, mypy, import layers, include layers"
 	@echo "make docs        the manual, into build/docs"
 	@echo "make bench       benchmarks, with the rivals in the same run"
@@ -85,7 +86,7 @@ dev: $(VENV)/.tools
 pytest: $(VENV)/.test
 	$(BIN)/python -m pytest -m "not slow" $(PYTEST)
 
-test-slow: $(VENV)/.test
+test-slow: sanitize-thread $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --timeout=1800 $(PYTEST)
 
 cpp = @$(BIN)/cmake -S . -B build/$(1) -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja \
@@ -96,6 +97,13 @@ cpp-test: $(VENV)/.tools
 	$(call cpp,cpp)
 sanitize: $(VENV)/.tools
 	$(call cpp,sanitize,-DPALPATE_SANITIZE=ON)
+
+# The session's threads and wait-free buffers under the thread sanitizer.
+sanitize-thread: $(VENV)/.tools
+	@$(BIN)/cmake -S . -B build/sanitize-thread -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja \
+	  -DPALPATE_BUILD_TESTS=ON -DPALPATE_WERROR=ON -DPALPATE_SANITIZE_THREAD=ON --log-level=WARNING >/dev/null
+	@$(BIN)/cmake --build build/sanitize-thread --target session_tests -- --quiet
+	$(BIN)/ctest --test-dir build/sanitize-thread/session --output-on-failure
 
 # What `cmake --install` leaves must be enough for another project's find_package(palpate).
 cpp-package: cpp-test
@@ -128,7 +136,7 @@ format: $(VENV)/.test
 	$(PIP_INSTALL) "clang-format>=18"
 	$(BIN)/ruff check --fix-only
 	$(BIN)/ruff format
-	find core bindings benchmarks examples -name '*.[ch]pp' -exec $(BIN)/clang-format -i {} +
+	find core session bindings benchmarks examples -name '*.[ch]pp' -exec $(BIN)/clang-format -i {} +
 
 clean:
 	rm -rf $(VENV) build dist src/palpate/_core.pyi docs/_build .pytest_cache .mypy_cache .ruff_cache .hypothesis \

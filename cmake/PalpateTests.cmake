@@ -16,8 +16,11 @@ function(palpate_add_tests prefix library include)
     target_link_libraries(${test} PRIVATE ${library} palpate_test_support palpate_warnings GTest::gtest_main)
     target_compile_definitions(${test} PRIVATE _GLIBCXX_ASSERTIONS)
     target_compile_options(${test} PRIVATE -Wno-dangling-else)  # EXPECT_* holds an if; it stands after ifs all the time
+    list(APPEND targets ${test})
     gtest_discover_tests(${test} TEST_PREFIX "${topic}." PROPERTIES TIMEOUT 300 DISCOVERY_TIMEOUT 60)
   endforeach()
+
+  add_custom_target(${prefix}_tests DEPENDS ${targets})
 
   # A header that leans on what its includer happened to include breaks the first user with another order.
   foreach(header IN LISTS ARGN)

@@ -291,6 +291,19 @@ TEST(ControlLoop, ADriverThatFailsEndsItWithTheDriversWords) {
   }
 }
 
+TEST(ControlLoop, WithoutAControllerItOnlyWatches) {
+  auto driver = std::make_shared<ScriptedDriver>(2, ms);
+  ControlLoop loop(two_links(), driver, nullptr, SafetyLimiter(2, LimiterConfig::of(*two_links())), small(), std::make_shared<SteppedClock>());
+  loop.begin();
+  for (int i = 0; i < 20; ++i) ASSERT_TRUE(loop.tick());
+  Request r;
+  r.enabled = true;
+  loop.request(r);
+  EXPECT_FALSE(loop.tick());
+  EXPECT_EQ(driver->enables, 0);
+  EXPECT_STREQ(loop.fault(), "the session has no controller: it only watches");
+}
+
 TEST(ControlLoop, TheEndOfARecordingIsNoFault) {
   Script s;
   s.driver->on_read = [](int i, RawSample&) { return i < 7 ? Reading::sample : Reading::finished; };

@@ -92,6 +92,7 @@ struct LoopStatistics {
 /// `lease` seconds, the loop calls the driver's stop() and is over: mode() says fault, fault() why.
 class ControlLoop {
  public:
+  /// controller: nullptr for a session that only watches; switching on is then a fault.
   /// Throws std::invalid_argument: something does not fit together.
   ControlLoop(std::shared_ptr<const Arm> arm, std::shared_ptr<Driver> driver, std::unique_ptr<Controller> controller, const SafetyLimiter& limiter,
               const LoopConfig& config, std::shared_ptr<Clock> clock)
@@ -304,6 +305,7 @@ class ControlLoop {
   bool change(bool usable) noexcept {
     if (request_.enabled) {
       if (!usable) return true;
+      if (controller_ == nullptr) return fail("the session has no controller: it only watches");
       if (!driver_->enable()) return fail(driver_->complaint());
       limiter_.reset();
       controller_->start(record_.touch);

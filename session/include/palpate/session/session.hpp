@@ -45,10 +45,8 @@ class Session {
   /// Stops the arm and ends the thread. Again is harmless; from any thread but the loop's, one at a time.
   void stop() noexcept {
     shared_->loop->stop();
-    if (!thread_.joinable()) {
-      if (!started_) shared_->loop->driver().stop();
-      return;
-    }
+    if (!started_) shared_->loop->tick();  // by the caller's hand, as every tick of a loop that has no thread
+    if (!thread_.joinable()) return;
     MonotonicClock clock;
     const std::int64_t end = clock.now() + static_cast<std::int64_t>(1e9 * grace_);
     while (!left() && clock.now() < end) clock.sleep_until(clock.now() + 1'000'000);
