@@ -48,7 +48,9 @@ FORBIDDEN_STD = set(
     "thread".split()
 )
 
-POSIX = set("pthread.h sched.h sys/mman.h time.h arpa/inet.h netinet/in.h poll.h sys/socket.h unistd.h".split())
+POSIX = set(
+    "pthread.h sched.h sys/mman.h time.h arpa/inet.h netinet/in.h poll.h sys/socket.h unistd.h".split()
+)
 
 INCLUDE = re.compile(r'^\s*#\s*include\s*([<"])([^>"]+)[>"]', re.MULTILINE)
 

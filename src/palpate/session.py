@@ -107,7 +107,7 @@ class SessionStatistics:
     own: Durations
     """time of a tick in the session's own work"""
     own_processor: Durations
-    """the same without the time in which the processor was taken away"""
+    """processor time for that and for the driver's write(): without the time in which the processor was taken away"""
     driver: Durations
     """time in the driver's read() and write(), its waiting included"""
     late: Durations

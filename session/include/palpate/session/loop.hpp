@@ -68,7 +68,7 @@ struct LostTicks {
 /// Counted from the start; any thread reads.
 struct LoopStatistics {
   Histogram own;     ///< time a tick spent in the loop's own work: estimate, control, limit, record [ns]
-  Histogram own_processor;  ///< the same in processor time of the thread: without what was taken away [ns]
+  Histogram own_processor;  ///< processor time of the thread for that and write(): without what was taken away [ns]
   Histogram driver;  ///< time in read() and write(); waiting for the period included if the driver is paced [ns]
   Histogram late;    ///< how late ticks began [ns]
   std::atomic<std::uint64_t> ticks{0}, samples{0};
@@ -160,7 +160,6 @@ class ControlLoop {
     }
     const std::int64_t decided = clock_->now();
     r.step_ns = decided - arrived;
-    std::int64_t processor_own = clock_->thread_time() - processor;
     std::size_t allocated_own = allocations() - allocated;
 
     if (usable && r.mode == Mode::enabled) {
@@ -168,7 +167,6 @@ class ControlLoop {
       r.commanded = true;
     }
     const std::int64_t written = clock_->now();
-    const std::int64_t processor_after = clock_->thread_time();
     const std::size_t allocated_after = allocations();
     r.write_ns = written - decided;
     if (reading == Reading::sample) {
@@ -177,13 +175,12 @@ class ControlLoop {
     }
     count(statistics_.ticks);
     end_ = clock_->now();
-    processor_own += clock_->thread_time() - processor_after;
     allocated_own += allocations() - allocated_after;
     own_ = r.step_ns + (end_ - written);
     driver_time_ = (driver_->paced() ? 0 : r.read_ns) + r.write_ns;
-    own_processor_ = processor_own;
+    own_processor_ = clock_->thread_time() - processor;
     statistics_.own.add(own_);
-    statistics_.own_processor.add(processor_own);
+    statistics_.own_processor.add(own_processor_);
     statistics_.driver.add(r.read_ns + r.write_ns);
     if (allocated_own != 0) statistics_.allocations.fetch_add(allocated_own, std::memory_order_relaxed);
 
