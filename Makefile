@@ -105,13 +105,10 @@ sanitize-thread: $(VENV)/.tools
 	@$(BIN)/cmake --build build/sanitize-thread --target session_tests -- --quiet
 	$(BIN)/ctest --test-dir build/sanitize-thread/session --output-on-failure
 
-# What `cmake --install` leaves must be enough for another project's find_package(palpate).
-cpp-package: cpp-test
-	@$(BIN)/cmake --install build/cpp --prefix build/install --component development >/dev/null
-	@$(BIN)/cmake -S examples/cpp -B build/example -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja \
-	  -DCMAKE_PREFIX_PATH=$(abspath build/install) --log-level=WARNING >/dev/null
-	@$(BIN)/cmake --build build/example -- --quiet
-	build/example/gravity
+# The README's lines for C++ users, as typed: what `cmake --install` leaves must be enough for another project.
+cpp-package: $(VENV)/.tools
+	@rm -rf build/home build/example
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python scripts/run_page.py README.md "In C++"
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check
