@@ -1,4 +1,4 @@
-"""Runs the shell lines of a Markdown page as a reader would type them: ``python scripts/run_page.py README.md "In C++"``.
+"""Runs the shell lines of a Markdown page as a reader would type them: ``run_page.py README.md "In C++"``.
 
 All ``sh`` blocks under that heading, from the top of the tree, with a home folder of their own.
 """
@@ -29,7 +29,9 @@ def main(page: str, heading: str) -> int:
     home = top / "build" / "home"
     home.mkdir(parents=True, exist_ok=True)
     env = dict(os.environ, HOME=str(home))
-    return subprocess.run(["bash", "-xeuo", "pipefail", "-c", script], cwd=top, env=env, check=False).returncode
+    return subprocess.run(
+        ["bash", "-xeuo", "pipefail", "-c", script], cwd=top, env=env, check=False
+    ).returncode
 
 
 if __name__ == "__main__":
