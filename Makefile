@@ -13,19 +13,20 @@ endif
 
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet
-SOURCES := $(sort $(shell find src core/include core/src bindings cmake -type f \
+SOURCES := $(sort $(shell find src core/include core/src session/include bindings cmake -type f \
              -not -name '*.pyc' -not -name '_core.*' 2>/dev/null)) \
-           CMakeLists.txt core/CMakeLists.txt pyproject.toml README.md
+           CMakeLists.txt core/CMakeLists.txt session/CMakeLists.txt pyproject.toml README.md
 
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help demo test test-slow cpp-test cpp-package lint docs bench wheel sanitize format dev clean FORCE
+.PHONY: help demo test test-slow cpp-test cpp-package lint docs bench wheel sanitize sanitize-thread format dev clean FORCE
 
 help:
 	@echo "make demo        install into $(VENV) and weigh something in simulation"
 	@echo "make test        C++ tests, lint, types, layers, docs, wheel, Python tests"
 	@echo "make test-slow   the tests that take minutes"
-	@echo "make cpp-test    only the C++ tests;  make sanitize: the same under ASan and UBSan"
+	@echo "make cpp-test    only the C++ tests;  make sanitize: the same under ASan and UBSan;"
+	@echo "                 make sanitize-thread: those of the session under TSan"
 	@echo "make lint        ruff, mypy, import layers, include layers"
 	@echo "make docs        the manual, into build/docs"
 	@echo "make bench       benchmarks, with the rivals in the same run"
@@ -85,7 +86,7 @@ dev: $(VENV)/.tools
 pytest: $(VENV)/.test
 	$(BIN)/python -m pytest -m "not slow" $(PYTEST)
 
-test-slow: $(VENV)/.test
+test-slow: sanitize-thread $(VENV)/.test
 	$(BIN)/python -m pytest -m slow --timeout=1800 $(PYTEST)
 
 cpp = @$(BIN)/cmake -S . -B build/$(1) -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja \
@@ -97,13 +98,17 @@ cpp-test: $(VENV)/.tools
 sanitize: $(VENV)/.tools
 	$(call cpp,sanitize,-DPALPATE_SANITIZE=ON)
 
-# What `cmake --install` leaves must be enough for another project's find_package(palpate).
-cpp-package: cpp-test
-	@$(BIN)/cmake --install build/cpp --prefix build/install --component development >/dev/null
-	@$(BIN)/cmake -S examples/cpp -B build/example -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja \
-	  -DCMAKE_PREFIX_PATH=$(abspath build/install) --log-level=WARNING >/dev/null
-	@$(BIN)/cmake --build build/example -- --quiet
-	build/example/gravity
+# The session's threads and wait-free buffers under the thread sanitizer.
+sanitize-thread: $(VENV)/.tools
+	@$(BIN)/cmake -S . -B build/sanitize-thread -G Ninja -DCMAKE_MAKE_PROGRAM=$(abspath $(BIN))/ninja \
+	  -DPALPATE_BUILD_TESTS=ON -DPALPATE_WERROR=ON -DPALPATE_SANITIZE_THREAD=ON --log-level=WARNING >/dev/null
+	@$(BIN)/cmake --build build/sanitize-thread --target session_tests -- --quiet
+	$(BIN)/ctest --test-dir build/sanitize-thread/session --output-on-failure
+
+# The README's lines for C++ users, as typed: what `cmake --install` leaves must be enough for another project.
+cpp-package: $(VENV)/.tools
+	@rm -rf build/home build/example
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python scripts/run_page.py README.md "In C++"
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check
@@ -128,7 +133,7 @@ format: $(VENV)/.test
 	$(PIP_INSTALL) "clang-format>=18"
 	$(BIN)/ruff check --fix-only
 	$(BIN)/ruff format
-	find core bindings benchmarks examples -name '*.[ch]pp' -exec $(BIN)/clang-format -i {} +
+	find core session bindings benchmarks examples -name '*.[ch]pp' -exec $(BIN)/clang-format -i {} +
 
 clean:
 	rm -rf $(VENV) build dist src/palpate/_core.pyi docs/_build .pytest_cache .mypy_cache .ruff_cache .hypothesis \

@@ -1,8 +1,7 @@
 // Trajectories, the controller and the safety limiter.
 #include "common.hpp"
+#include "objects.hpp"
 
-#include "palpate/control/feedforward_pd.hpp"
-#include "palpate/control/limiter.hpp"
 #include "palpate/trajectory.hpp"
 
 using namespace palpate;
@@ -13,10 +12,6 @@ namespace {
 struct PyQuintic {
   Quintic quintic;
   int n;
-};
-struct PyController {
-  std::shared_ptr<const Arm> arm;
-  FeedforwardPd pd;
 };
 
 nb::tuple setpoint(const Setpoint& s, int n) { return nb::make_tuple(array(s.q, n), array(s.dq, n), array(s.ddq, n)); }
@@ -47,10 +42,6 @@ void bind_control(nb::module_& m) {
         return nb::make_tuple(array(command.torque, n), command.status);
       }, nb::arg("q_d"), nb::arg("dq_d"), nb::arg("ddq_d"), nb::arg("q"), nb::arg("dq"), nb::arg("load"), "Returns (torque [N m], status).");
 
-  struct PyLimiter {
-    SafetyLimiter limiter;
-    int n;
-  };
   nb::class_<PyLimiter>(m, "SafetyLimiter", "The last thing a command passes before the driver: torque, rate, position and velocity limits, faults.")
       .def("__init__", [](PyLimiter* self, const Vector& torque, const Vector& torque_rate, const Vector& lower, const Vector& upper, const Vector& velocity,
                           const Vector& approach, const Vector& damping) {

@@ -2,6 +2,7 @@
 
 A unit is a header, or a folder of headers (observers, control). A header may include its own folder's
 headers, the units that ALLOWED gives it, and the standard library without what a control loop must not touch.
+The session's headers may include the core, the whole standard library and POSIX; the core never includes them.
 """
 
 from __future__ import annotations
@@ -47,6 +48,10 @@ FORBIDDEN_STD = set(
     "thread".split()
 )
 
+POSIX = set(
+    "pthread.h sched.h sys/mman.h time.h arpa/inet.h netinet/in.h poll.h sys/socket.h unistd.h".split()
+)
+
 INCLUDE = re.compile(r'^\s*#\s*include\s*([<"])([^>"]+)[>"]', re.MULTILINE)
 
 
@@ -83,10 +88,28 @@ def faults(include_root: Path) -> list[str]:
     return found
 
 
+def session_faults(session_root: Path, core_root: Path) -> list[str]:
+    """The same for the session's headers."""
+    found = []
+    for header in sorted((session_root / "palpate").rglob("*.hpp")):
+        name = header.relative_to(session_root).as_posix()
+        text = header.read_text(encoding="utf-8")
+        if "#pragma once" not in text:
+            found.append(f"{name}: no #pragma once")
+        for bracket, target in INCLUDE.findall(text):
+            if bracket == "<":
+                if ("/" in target or "." in target) and target not in POSIX:
+                    found.append(f"{name}: <{target}> is neither of the standard library nor in POSIX here")
+            elif not any((root / target).is_file() for root in (session_root, core_root)):
+                found.append(f'{name}: "{target}" does not exist; write the full path "palpate/..."')
+    return found
+
+
 def main() -> int:
-    root = Path(__file__).resolve().parent.parent / "core" / "include"
-    lines = faults(root)
-    count = len(list(root.rglob("*.hpp")))
+    top = Path(__file__).resolve().parent.parent
+    root, session = top / "core" / "include", top / "session" / "include"
+    lines = faults(root) + session_faults(session, root)
+    count = len([*root.rglob("*.hpp"), *session.rglob("*.hpp")])
     print("\n".join(lines) if lines else f"includes: {count} headers keep to the layers")
     return 1 if lines else 0
 

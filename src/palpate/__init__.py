@@ -59,6 +59,7 @@ from .pipeline import (
     status_names,
     tare,
 )
+from .session import Realtime, Session, SimulatedArm
 from .velocity import JointVelocity, SenderClock, SenderStamp, SenderStamps
 
 __all__ = [
@@ -107,6 +108,7 @@ __all__ = [
     "Pipeline",
     "Posture",
     "Quintic",
+    "Realtime",
     "Recorder",
     "Regression",
     "SafetyLimiter",
@@ -115,8 +117,10 @@ __all__ = [
     "SenderStamp",
     "SenderStamps",
     "Sensing",
+    "Session",
     "Setpoint",
     "Shape",
+    "SimulatedArm",
     "SlidingModeObserver",
     "Status",
     "Tare",

@@ -113,6 +113,11 @@ class Controller:
             raise InputError(str(e)) from None
         self._nothing = Load()
 
+    @property
+    def core(self) -> CoreController:
+        """The C++ controller."""
+        return self._core
+
     def step(self, setpoint: Setpoint, q: Array, dq: Array, load: Load | None = None) -> tuple[Array, Status]:
         """Torque [N m] and status (saturated, non_finite) for the estimated state q, dq and what is held."""
         torque, status = self._core.step(
@@ -166,6 +171,11 @@ class SafetyLimiter:
             )
         except ValueError as e:
             raise InputError(str(e)) from None
+
+    @property
+    def core(self) -> CoreLimiter:
+        """The C++ limiter."""
+        return self._core
 
     def step(self, torque: Array, q: Array, dq: Array, dt: float) -> tuple[Array, Status]:
         """The torque [N m] that may be sent, and ok, saturated, non_finite or time_error."""

@@ -29,6 +29,7 @@ from ._core import (
 )
 from ._core import Load as CoreLoad
 from ._core import Pipeline as CorePipeline
+from ._core import Touch as CoreTouch
 from ._core import tare as core_tare
 from .arm import Arm, Array, Effort
 from .errors import ArmError, InputError, suggest
@@ -288,6 +289,10 @@ class Pipeline:
             t = self._core.step(sample.time_ns, sample.position, sample.velocity, effort, sample.model_torque)
         except (ValueError, TypeError) as e:
             raise InputError(f"sample: {str(e).splitlines()[0]}") from None
+        return self.touch_of(t)
+
+    def touch_of(self, t: CoreTouch) -> Touch:
+        """What the core found for one sample with a pipeline of these options."""
         return Touch(
             t.time_ns,
             cast(Array, t.q),
@@ -344,6 +349,11 @@ class Pipeline:
             None if self.wrench is None else Wrench(**r["wrench"]),
             None if self.contact is None else Contact(**r["contact"]),
         )
+
+    @property
+    def core(self) -> CorePipeline:
+        """The C++ pipeline."""
+        return self._core
 
     @property
     def load(self) -> CoreLoad:

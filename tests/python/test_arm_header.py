@@ -103,6 +103,11 @@ def test_header_holds_the_arm_to_the_bit(tmp_path):
         assert all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(read, expected, strict=True))
 
 
+def test_the_example_uses_the_header_that_is_written():
+    kept = Path(__file__).resolve().parents[2] / "examples" / "cpp" / "justina_left_arm.hpp"
+    assert kept.read_text("utf-8") == robots.load("justina_left_arm").to_header()
+
+
 def test_header_name():
     arm = robots.load("kuka_lbr_iiwa7")
     assert "inline constexpr palpate::ArmDescription kuka_lbr_iiwa7{" in arm.to_header()

@@ -1,4 +1,4 @@
-// Joint trajectories from rest to rest: the quintic, and a schedule of quintics with dwell times between them.
+// Joint trajectories: the quintic from rest to rest, the same from any motion, a schedule of quintics with dwell times.
 #pragma once
 #include <algorithm>
 #include <array>
@@ -93,6 +93,59 @@ class Quintic {
   std::size_t n_ = 0;
   double T_ = 0.0;
   JointVector q0_{}, q1_{};
+};
+
+/// The fifth-degree polynomial from any state of motion to rest at a goal: a goal that changes while the arm moves.
+///
+///   q(t) = q_0 + v_0 t + a_0 t^2/2 + c_3 t^3 + c_4 t^4 + c_5 t^5,  q(T) = q_1, dq(T) = ddq(T) = 0.
+///
+/// q_0, v_0, a_0 [rad, rad/s, rad/s^2] where it begins, q_1 goal [rad], T duration [s]. Made within a loop: nothing is
+/// thrown. A joint may swing beyond both ends if it begins fast and T is long.
+class Transfer {
+ public:
+  Transfer() = default;  ///< stands at zero
+
+  /// Stands at q.
+  explicit Transfer(const JointVector& q) noexcept : q1_(q) {}
+
+  /// From `start` to rest at `goal`. duration [s]; not a finite number > 0: it is at the goal at once.
+  Transfer(int n, const Setpoint& start, const JointVector& goal, double duration) noexcept
+      : n_(static_cast<std::size_t>(n)), T_(std::isfinite(duration) && duration > 0.0 ? duration : 0.0), start_(start), q1_(goal) {
+    for (std::size_t j = 0; j < n_ && T_ > 0.0; ++j) {
+      const double D = goal[j] - start.q[j], v = start.dq[j] * T_, a = start.ddq[j] * T_ * T_;
+      c3_[j] = 10.0 * D - 6.0 * v - 1.5 * a;
+      c4_[j] = -15.0 * D + 8.0 * v + 1.5 * a;
+      c5_[j] = 6.0 * D - 3.0 * v - 0.5 * a;
+    }
+  }
+
+  [[nodiscard]] double duration() const noexcept { return T_; }  ///< [s]
+  [[nodiscard]] const JointVector& goal() const noexcept { return q1_; }
+
+  /// Where to be at time t [s] since the start. NaN counts as "not started".
+  [[nodiscard]] Setpoint sample(double t) const noexcept {
+    Setpoint p;
+    if (t >= T_) {
+      p.q = q1_;
+      return p;
+    }
+    if (!(t > 0.0)) return start_;
+    const double s = t / T_;
+    for (std::size_t j = 0; j < n_; ++j) {
+      const double v = start_.dq[j] * T_, a = start_.ddq[j] * T_ * T_;
+      p.q[j] = start_.q[j] + s * (v + s * (0.5 * a + s * (c3_[j] + s * (c4_[j] + s * c5_[j]))));
+      p.dq[j] = (v + s * (a + s * (3.0 * c3_[j] + s * (4.0 * c4_[j] + s * 5.0 * c5_[j])))) / T_;
+      p.ddq[j] = (a + s * (6.0 * c3_[j] + s * (12.0 * c4_[j] + s * 20.0 * c5_[j]))) / (T_ * T_);
+    }
+    return p;
+  }
+
+ private:
+  std::size_t n_ = 0;
+  double T_ = 0.0;
+  Setpoint start_{};
+  JointVector q1_{};
+  JointVector c3_{}, c4_{}, c5_{};  // of s = t/T [rad]
 };
 
 /// Up to 32 motions one after the other, each followed by a dwell at its goal: tare and calibration motions.

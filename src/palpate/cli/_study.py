@@ -33,6 +33,14 @@ Hours = Annotated[
         show_default=False,
     ),
 ]
+Minutes = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MIN",
+        help="Run so long instead of the 10 min asked for (session, fri, rtde, servos only).",
+        show_default=False,
+    ),
+]
 Page = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Also keep the tables in this Markdown page, one section per study."),
@@ -51,6 +59,7 @@ def run(
     json: bool,
     quiet: bool,
     hours: float | None = None,
+    minutes: float | None = None,
 ) -> int:
     """Run the studies of a verb; 1 if a row misses."""
     from ..studies import STUDIES
@@ -73,17 +82,22 @@ def run(
                 else f"no study {name!r}; {suggest(name, known, 'there are')}"
             )
         chosen.append(known[name])
-    if hours is not None:
-        if not (math.isfinite(hours) and hours > 0.0):
-            raise InputError(f"--hours: expected a number > 0, got {hours:g}")
+    for option, length, able, what in (
+        ("--hours", hours, [s.name for s in known.values() if s.campaign], "a campaign is"),
+        ("--minutes", minutes, [s.name for s in known.values() if s.timed], "by the wall's clock runs"),
+    ):
+        if length is None:
+            continue
+        if not (math.isfinite(length) and length > 0.0):
+            raise InputError(f"{option}: expected a number > 0, got {length:g}")
         if quick:
-            raise InputError("--hours and --quick: a quick run has its own length; give one of them")
-        if fixed := [study.name for study in chosen if not study.campaign]:
-            able = ", ".join(s.name for s in known.values() if s.campaign)
-            raise InputError(f"--hours: {', '.join(fixed)} runs for a fixed time; a campaign is: {able}")
+            raise InputError(f"{option} and --quick: a quick run has its own length; give one of them")
+        if fixed := [study.name for study in chosen if study.name not in able]:
+            raise InputError(f"{option}: {', '.join(fixed)} runs for a fixed time; {what}: {', '.join(able)}")
     make_folder(out)
     results = [
-        (study, *_measure(study, out, quick=quick, hours=hours, silent=json or quiet)) for study in chosen
+        (study, *_measure(study, out, quick=quick, hours=hours, minutes=minutes, silent=json or quiet))
+        for study in chosen
     ]
     if page is not None:
         from ..report import markdown_table, update_markdown
@@ -101,13 +115,15 @@ def run(
 
 
 def _measure(
-    study: Study, out: Path, *, quick: bool, hours: float | None, silent: bool
+    study: Study, out: Path, *, quick: bool, hours: float | None, minutes: float | None, silent: bool
 ) -> tuple[StudyResult, dict[str, str]]:
     """Run one study and write it; print it unless silent."""
     from ..report import write_study
 
-    campaign: dict[str, Any] = {"folder": out, "hours": hours} if study.campaign else {}
-    result = study.run(None if silent else _Bar(study.name), quick=quick, **campaign)
+    length: dict[str, Any] = {"folder": out, "hours": hours} if study.campaign else {}
+    if study.timed:
+        length["minutes"] = minutes
+    result = study.run(None if silent else _Bar(study.name), quick=quick, **length)
     written = write_study(
         result.rows,
         result.figures,

@@ -211,7 +211,7 @@ def export(
     repair: Repair = False,
 ) -> int:
     """Export an arm."""
-    from ..weigh.session import card_text
+    from ..session import card_text
 
     if card is None and urdf is None and header is None:
         raise InputError("nothing to write: give --card, --urdf or --header and a file")

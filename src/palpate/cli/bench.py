@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from ._common import Json, Quiet, examples
-from ._study import Hours, List, Names, Out, Page, Quick
+from ._study import Hours, List, Minutes, Names, Out, Page, Quick
 from ._study import run as run_studies
 
 
@@ -21,6 +21,7 @@ def add(app: typer.Typer) -> None:
             "palpate bench --list",
             "palpate bench payload-filter",
             "palpate bench contacts --hours 10",
+            "palpate bench session --minutes 1",
             "palpate bench --quick",
         ),
     )(run)
@@ -32,6 +33,7 @@ def run(
     page: Page = None,
     quick: Quick = False,
     hours: Hours = None,
+    minutes: Minutes = None,
     listing: List = False,
     json: Json = False,
     quiet: Quiet = False,
@@ -44,6 +46,7 @@ def run(
         page=page,
         quick=quick,
         hours=hours,
+        minutes=minutes,
         listing=listing,
         json=json,
         quiet=quiet,

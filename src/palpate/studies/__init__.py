@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from ..errors import InputError
 from ..report.study import StudyRow as Row
@@ -62,6 +62,8 @@ class Study:
     """within palpate.studies; empty: the name with underscores"""
     campaign: bool = False
     """it simulates for hours, as many as are wanted, and can keep what is done to go on another time"""
+    timed: bool = False
+    """it runs by the wall's clock, for as many minutes as are wanted"""
 
     def run(
         self,
@@ -70,6 +72,7 @@ class Study:
         *,
         folder: Path | None = None,
         hours: float | None = None,
+        minutes: float | None = None,
     ) -> StudyResult:
         """Measure.
 
@@ -78,15 +81,20 @@ class Study:
             quick: few repetitions, to see that it works. The rows then say so and judge nothing.
             folder: where a campaign keeps what is done; None: nowhere.
             hours: simulated by a campaign [h]; None: as many as its figure asks for.
+            minutes: of a timed study [min]; None: as many as its figure asks for.
 
         Raises:
-            InputError: hours are given for a study that is no campaign.
+            InputError: hours are given for a study that is no campaign, minutes for one that is not timed.
             MissingExtraError: the study needs an extra, mostly ``sim``.
         """
         module = importlib.import_module(f"{__name__}.{self.module or self.name.replace('-', '_')}")
         if hours is not None and not self.campaign:
             raise InputError(f"study {self.name!r} is no campaign: its length is fixed")
-        options = {"folder": folder, "hours": hours} if self.campaign else {}
+        if minutes is not None and not self.timed:
+            raise InputError(f"study {self.name!r} does not run by the wall's clock: its length is fixed")
+        options: dict[str, Any] = {"folder": folder, "hours": hours} if self.campaign else {}
+        if self.timed:
+            options["minutes"] = minutes
         begin = time.perf_counter()
         rows, figures, notes = module.run(progress or _silent, quick, **options)
         if quick:
@@ -131,6 +139,7 @@ _ALL = (
     Study(
         "board-detection", "Whiteboards found in rendered views and photographs, and the ink on them", "bench"
     ),
+    Study("session", "The real-time session at 1 kHz while the computer is busy", "bench", timed=True),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
 

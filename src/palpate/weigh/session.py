@@ -21,6 +21,7 @@ from ..control import Controller, Quintic, SafetyLimiter, Setpoint
 from ..errors import InputError, LogError, PalpateError
 from ..logs import Log, Recorder, Sample, Signal
 from ..pipeline import ExternalTorque, Payload, Pipeline, Touch
+from ..session import card_text
 from .scenes import NOISE_COUNTS, Scene, gains_at
 
 if TYPE_CHECKING:
@@ -246,14 +247,6 @@ class _Control:
 def arrival(task: Task) -> float:
     """When the last pose should be reached [s]."""
     return _Route(task).end
-
-
-def card_text(arm: Arm) -> str:
-    """The arm's card as text."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "arm.yaml"
-        arm.save(path)
-        return path.read_text(encoding="utf-8")
 
 
 def describe(task: Task, pipeline: Pipeline) -> dict[str, str]:

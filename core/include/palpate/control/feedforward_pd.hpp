@@ -36,6 +36,8 @@ class FeedforwardPd {
     }
     return pd_.step(setpoint, q, dq, u, time_ns);
   }
+  /// As PdGravity::set_gains().
+  bool set_gains(const JointVector& kp, const JointVector& kd) noexcept { return pd_.set_gains(kp, kd); }
   void reset() noexcept { pd_.reset(); }
 
  private:

@@ -7,6 +7,7 @@
 #include <cstdint>
 #include <limits>
 
+#include "palpate/arm.hpp"
 #include "palpate/check.hpp"
 #include "palpate/types.hpp"
 
@@ -23,6 +24,23 @@ struct LimiterConfig {
   JointVector damping{};      ///< D: torque per excess of speed [N m s/rad], > 0; see the class
   double fault_decay = 0.1;   ///< time constant with which a command fades after a fault [s], > 0
   double max_dt = 0.1;        ///< a longer time step gives the torque rate no more room than this one [s], > 0
+
+  /// What the arm's figures say: its limits, no torque rate, approach 5/s, damping effort limit over velocity limit.
+  static LimiterConfig of(const Arm& arm) noexcept {
+    LimiterConfig c;
+    for (int i = 0; i < arm.n(); ++i) {
+      const auto j = static_cast<std::size_t>(i);
+      const JointDescription& d = arm.joint(i);
+      c.torque[j] = d.max_effort;
+      c.torque_rate[j] = std::numeric_limits<double>::infinity();
+      c.lower[j] = d.lower;
+      c.upper[j] = d.upper;
+      c.velocity[j] = d.max_velocity;
+      c.approach[j] = 5.0;
+      c.damping[j] = std::isfinite(d.max_velocity) ? d.max_effort / d.max_velocity : d.max_effort;
+    }
+    return c;
+  }
 };
 
 /// What limited a command; a bit mask.

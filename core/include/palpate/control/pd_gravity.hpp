@@ -36,6 +36,15 @@ class PdGravity {
     }
   }
 
+  /// Other kp [N m/rad] and kd [N m s/rad] from the next step on. False: not all are finite and >= 0; the old ones stay.
+  bool set_gains(const JointVector& kp, const JointVector& kd) noexcept {
+    for (std::size_t j = 0; j < n_; ++j)
+      if (!(std::isfinite(kp[j]) && kp[j] >= 0.0 && std::isfinite(kd[j]) && kd[j] >= 0.0)) return false;
+    gains_.kp = kp;
+    gains_.kd = kd;
+    return true;
+  }
+
   [[nodiscard]] JointCommand step(const Setpoint& setpoint, const JointVector& q, const JointVector& dq, const JointVector& feedforward,
                                   std::int64_t time_ns = 0) noexcept {
     JointCommand command;

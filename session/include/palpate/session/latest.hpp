@@ -1,0 +1,39 @@
+// Latest: the newest value from one thread to another, wait-free on both sides.
+#pragma once
+#include <array>
+#include <atomic>
+#include <cstdint>
+
+namespace palpate {
+
+/// Triple buffer between one writer and one reader thread. write() never waits for the reader, read() never for the writer,
+/// and what is read was written as a whole: each side owns a slot, the third changes hands in one atomic exchange.
+template <class T>
+class Latest {
+ public:
+  Latest() = default;
+  explicit Latest(const T& first) { slots_.fill(first); }
+
+  /// Writer: replaces what was not read yet.
+  void write(const T& value) noexcept {
+    slots_[back_] = value;
+    back_ = middle_.exchange(static_cast<std::uint8_t>(back_ | fresh), std::memory_order_acq_rel) & slot;
+  }
+
+  /// Reader: the newest value; false if it is the one of the last read().
+  bool read(T& out) noexcept {
+    const bool newer = (middle_.load(std::memory_order_relaxed) & fresh) != 0;
+    if (newer) front_ = middle_.exchange(front_, std::memory_order_acq_rel) & slot;
+    out = slots_[front_];
+    return newer;
+  }
+
+ private:
+  static constexpr std::uint8_t slot = 3, fresh = 4;
+  std::array<T, 3> slots_{};
+  std::uint8_t back_ = 0;               // the writer's
+  std::atomic<std::uint8_t> middle_{1};
+  std::uint8_t front_ = 2;              // the reader's
+};
+
+}  // namespace palpate
