@@ -38,8 +38,9 @@ struct ContactConfig {
 /// slow and small in motion; at rest anything within stiction +-F, and quick, as a drive may load its gear at any time without
 /// moving it; and so for a moment after rest, until friction has settled. Within +-sqrt(3 V), at rest stiction and two deviations
 /// of the slow errors, b walks at random, 2 V/T per second (to any place at once while the direction of motion is not sure), and
-/// may stay where it is; beyond it stiction drives it no further and it returns with time constant T, or a contact has brought
-/// it there. A turn of the sign renews it (SignTravel). So reversals, starts and stops are no contacts.
+/// may stay where it is; beyond it stiction drives it no further, and it returns: within model_time while the joint creeps, for
+/// then it is a rare slow error; within rest_time while it may stand still, for then the model's errors do too; or a contact
+/// has brought it there. A turn of the sign renews it (SignTravel). So reversals, starts and stops are no contacts.
 /// A Kalman filter of two states per joint, (p, b), takes all that is expected out of z; what is left, e = innovation/std, is
 /// white with variance 1 as long as nothing touches the arm. Then for kappa = 1/4, 1/2, 1, 2, from soft contacts to hard ones,
 ///   g+ <- max(0, g+ + e - kappa),  g- <- max(0, g- - e - kappa),  alarm at g > h(kappa).
@@ -111,6 +112,7 @@ class ContactDetector {
       return report(s.status == Status::ok ? Status::warming : s.status);
     }
     update_threshold(s.dt);
+    decay_.of(s.dt, config_);
     elapsed_ += s.dt;
     for (int j = 0; j < arm_->n(); ++j) follow(j, s, load, m);
     beta_ = m.beta;
@@ -156,6 +158,20 @@ class ContactDetector {
 
     /// The part of b that the model's errors may be.
     double stiction(double x) const noexcept { return std::clamp(x, center - bound, center + bound); }
+  };
+  /// What fades within a sample; exponentials cost as much as all else, and most periods are equal.
+  struct Decay {
+    double dt = 0.0, settle = 0.0, still = 0.0, back = 0.0, slow = 0.0, quick = 0.0, contact = 0.0;
+    void of(double h, const ContactConfig& c) noexcept {
+      if (h == dt) return;
+      dt = h;
+      settle = std::exp(-h / c.settle_time);
+      still = -std::expm1(-h / c.rest_time);
+      back = -std::expm1(-h / c.model_time);
+      slow = -std::expm1(-2.0 * h / c.model_time);
+      quick = -std::expm1(-2.0 * h / c.rest_time);
+      contact = -std::expm1(-h / c.contact_time);
+    }
   };
   struct Measurement {
     JointVector z{}, input{}, beta{}, variance{}, slope{};  // variance of z
@@ -247,12 +263,11 @@ class ContactDetector {
     J.dq = s.dq[u(j)];
     // What friction was loaded with at rest wears off with time, and no sooner than over the travel in which it turns over.
     const double kept = friction.presliding > 0.0 ? std::exp(-h * std::abs(s.dq[u(j)]) / friction.presliding) : 0.0;
-    J.rest = std::max(undirected ? 1.0 : 1.0 - square(std::tanh(s.dq[u(j)] / friction.sign_velocity)), J.rest * std::max(std::exp(-h / config_.settle_time), kept));
+    J.rest = std::max(undirected ? 1.0 : 1.0 - square(std::tanh(s.dq[u(j)] / friction.sign_velocity)), J.rest * std::max(decay_.settle, kept));
     const double V = model_variance(j, s, load, J.rest), V_rest = J.rest * rest_variance(j, s);
-    const double back = -std::expm1(-h * (J.rest / config_.rest_time + (1.0 - J.rest) / config_.model_time));
     const double turned = J.travel.step(friction, s.dq[u(j)], s.dq_std[u(j)]) * rest_variance(j, s);
-    const double slow = (V - V_rest) * -std::expm1(-2.0 * h / config_.model_time);
-    const double quick = undirected ? 4.0 * V_rest : V_rest * -std::expm1(-2.0 * h / config_.rest_time);
+    const double slow = (V - V_rest) * decay_.slow;
+    const double quick = undirected ? 4.0 * V_rest : V_rest * decay_.quick;
     J.bound = (1.0 - J.rest) * std::sqrt(3.0 * V) + J.rest * (std::sqrt(3.0 * V_rest) + 2.0 * std::sqrt(V - V_rest));
     const double dry = friction.level(s.dq[u(j)]) * std::tanh(s.dq[u(j)] / friction.sign_velocity);
     J.center = J.rest * (0.5 * (dry + J.dry) + s.friction_excess[u(j)]);  // the model's own, whatever noise of dq makes of either
@@ -262,7 +277,7 @@ class ContactDetector {
 
     // What acted in this step alone, and its low-pass: the contact's torque when there is one.
     const double now = momentum ? (z - J.z) / h - input : z;
-    const double a = -std::expm1(-h / config_.contact_time);
+    const double a = decay_.contact;
     J.fast += (elapsed_ > h ? a : 1.0) * (now - J.fast);
     J.fast_variance = a / (2.0 - a) * white + (momentum ? 2.0 * square(a / h) / (2.0 - a) * R : 0.0);
     J.z = z;
@@ -275,7 +290,7 @@ class ContactDetector {
 
     // Prediction and update of (p, b), or of b alone. Friction at rest is quick up to the bound, not beyond it.
     const double b_before = J.b;
-    J.b -= back * (J.b - J.stiction(J.b));
+    J.b -= (undirected ? decay_.still : decay_.back) * (J.b - J.stiction(J.b));
     if (momentum) J.p += h * (input + b_before);
     const double y = momentum ? z - J.p : z - J.b;
     const double off = J.b - J.center;
@@ -472,6 +487,7 @@ class ContactDetector {
   JointVector M_at_{}, beta_{}, tau_{};
   double mean_dt_ = 0.0, threshold_dt_ = 0.0, elapsed_ = 0.0;
   double most_beyond_ = 0.0;
+  Decay decay_{};
   std::array<double, 4> h_{};
   std::int64_t last_ns_ = 0, felt_ns_ = 0;
   bool known_ = false;
