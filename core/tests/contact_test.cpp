@@ -309,6 +309,7 @@ TEST(Contact, ASlowPushAtRestIsFoundOnceItOutdoesStiction) {
       if (seen.count > 0) {
         EXPECT_EQ(seen.count, 1u) << "one push, one contact";
         EXPECT_EQ(seen.link, 0);
+        EXPECT_NEAR(static_cast<double>(seen.onset_time_ns) * 1e-9, 1.0, 0.15) << "where the push began, not where it outdid stiction";
       }
     }
   }

@@ -55,7 +55,8 @@ struct ContactConfig {
 /// of a joint that surely rests (rho > 0.9), once it has been within (what is there at a start, or stays after a contact, is a
 /// load); that contact lasts while it is > 3.
 ///
-/// The onset is when the alarmed sum last left zero. From then on b of an alarmed joint is kept and what the joint feels beyond
+/// The onset is when the alarmed sum last left zero; of a joint at rest, when what acts left the level it had had for a while: a
+/// push shows in the motor long before it outdoes stiction, but so may stiction. From then on b of an alarmed joint is kept and what the joint feels beyond
 /// it is the contact's torque c, until it has been within three standard deviations, or stiction, for release_time.
 /// A contact on link k is felt by joints 1..k only: `link` is the last joint that feels it, by alarm and by
 ///   |c_j| > 3 std_j + f sum_i |M_ji/M_ii c_i|   for contact_time,   f = 1/5 + 4/5 exp(-time since the alarm/(5 contact_time)):
@@ -155,13 +156,16 @@ class ContactDetector {
     double steady = 0.0, beyond = 0.0;           // what acts off center, clipped and low-passed [N m]; how far beyond stiction at rest [std]
     bool armed = false, held = false;            // it was within stiction; it alarmed by being beyond, and is still
     std::int64_t within_ns = 0;                  // when it last was
+    double level = 0.0;                          // steady, as it has been for a while [N m]
+    std::int64_t level_ns = 0;                   // when steady was last there
+    bool rested = false;                         // and the joint rested then
 
     /// The part of b that the model's errors may be.
     double stiction(double x) const noexcept { return std::clamp(x, center - bound, center + bound); }
   };
   /// What fades within a sample; exponentials cost as much as all else, and most periods are equal.
   struct Decay {
-    double dt = 0.0, settle = 0.0, still = 0.0, back = 0.0, slow = 0.0, quick = 0.0, contact = 0.0;
+    double dt = 0.0, settle = 0.0, still = 0.0, back = 0.0, slow = 0.0, quick = 0.0, contact = 0.0, level = 0.0;
     void of(double h, const ContactConfig& c) noexcept {
       if (h == dt) return;
       dt = h;
@@ -171,6 +175,7 @@ class ContactDetector {
       slow = -std::expm1(-2.0 * h / c.model_time);
       quick = -std::expm1(-2.0 * h / c.rest_time);
       contact = -std::expm1(-h / c.contact_time);
+      level = -std::expm1(-h / (10.0 * c.contact_time));
     }
   };
   struct Measurement {
@@ -200,6 +205,10 @@ class ContactDetector {
       // A differentiated velocity is that of half a step ago, and so must be the torque.
       m.input[u(j)] = s.velocity_measured ? s.tau[u(j)] : 0.5 * (s.tau[u(j)] + tau_[u(j)]);
       m.slope[u(j)] = friction.derivative(s.dq[u(j)]);
+      if (friction.presliding > 0.0) {  // its sign goes with the travel, not with the noise of dq
+        const double sign = std::tanh(s.dq[u(j)] / friction.sign_velocity);
+        m.slope[u(j)] -= friction.level(s.dq[u(j)]) * (1.0 - sign * sign) / friction.sign_velocity;
+      }
       double sum = 0.0;
       for (int k = 0; k < n; ++k) sum += square(M_(j, k) * std::max(s.dq_std[u(k)], 1e-7));
       m.variance[u(j)] = sum;
@@ -285,6 +294,8 @@ class ContactDetector {
     const double moved = now - J.center - J.steady;
     J.steady += elapsed_ < config_.warm_up ? (elapsed_ > h ? a : 1.0) * moved : a * std::clamp(moved, -most, most);
     J.beyond = J.rest > 0.9 ? std::max(0.0, std::abs(J.steady) - std::sqrt(3.0 * V_rest)) / std::sqrt(J.fast_variance + V - V_rest) : 0.0;
+    if (elapsed_ < config_.warm_up || std::abs(J.steady - J.level) < 3.0 * std::sqrt(J.fast_variance)) J.level_ns = s.time_ns, J.rested = J.rest > 0.5;
+    J.level += (elapsed_ < config_.warm_up ? 1.0 : decay_.level) * (J.steady - J.level);
     if (J.beyond < 3.0) J.held = false;
     if (J.beyond < 1.0) J.armed = elapsed_ >= config_.warm_up, J.within_ns = last_ns_;
 
@@ -352,6 +363,7 @@ class ContactDetector {
       J.feels = alarm = true;
       if (!contact_.active) J.base = J.held ? J.center : J.rest > 0.5 ? J.stiction(first->b) : first->b;
       onset = std::min(onset, J.held ? J.within_ns : first->since_ns);
+      if (J.rested) onset = std::min(onset, J.level_ns);
     }
     if (alarm && !contact_.active) {
       contact_.active = true;
