@@ -38,8 +38,9 @@ struct ContactConfig {
 /// slow and small in motion; at rest anything within stiction +-F, and quick, as a drive may load its gear at any time without
 /// moving it; and so for a moment after rest, until friction has settled. Within +-sqrt(3 V), at rest stiction and two deviations
 /// of the slow errors, b walks at random, 2 V/T per second (to any place at once while the direction of motion is not sure), and
-/// may stay where it is; beyond it stiction drives it no further and it returns with time constant T, or a contact has brought
-/// it there. A turn of the sign renews it (SignTravel). So reversals, starts and stops are no contacts.
+/// may stay where it is; beyond it stiction drives it no further, and it returns: within model_time while the joint creeps, for
+/// then it is a rare slow error; within rest_time while it may stand still, for then the model's errors do too; or a contact
+/// has brought it there. A turn of the sign renews it (SignTravel). So reversals, starts and stops are no contacts.
 /// A Kalman filter of two states per joint, (p, b), takes all that is expected out of z; what is left, e = innovation/std, is
 /// white with variance 1 as long as nothing touches the arm. Then for kappa = 1/4, 1/2, 1, 2, from soft contacts to hard ones,
 ///   g+ <- max(0, g+ + e - kappa),  g- <- max(0, g- - e - kappa),  alarm at g > h(kappa).
@@ -54,7 +55,8 @@ struct ContactConfig {
 /// of a joint that surely rests (rho > 0.9), once it has been within (what is there at a start, or stays after a contact, is a
 /// load); that contact lasts while it is > 3.
 ///
-/// The onset is when the alarmed sum last left zero. From then on b of an alarmed joint is kept and what the joint feels beyond
+/// The onset is when the alarmed sum last left zero; of a joint at rest, when what acts left the level it had had for a while: a
+/// push shows in the motor long before it outdoes stiction, but so may stiction. From then on b of an alarmed joint is kept and what the joint feels beyond
 /// it is the contact's torque c, until it has been within three standard deviations, or stiction, for release_time.
 /// A contact on link k is felt by joints 1..k only: `link` is the last joint that feels it, by alarm and by
 ///   |c_j| > 3 std_j + f sum_i |M_ji/M_ii c_i|   for contact_time,   f = 1/5 + 4/5 exp(-time since the alarm/(5 contact_time)):
@@ -111,6 +113,7 @@ class ContactDetector {
       return report(s.status == Status::ok ? Status::warming : s.status);
     }
     update_threshold(s.dt);
+    decay_.of(s.dt, config_);
     elapsed_ += s.dt;
     for (int j = 0; j < arm_->n(); ++j) follow(j, s, load, m);
     beta_ = m.beta;
@@ -153,9 +156,27 @@ class ContactDetector {
     double steady = 0.0, beyond = 0.0;           // what acts off center, clipped and low-passed [N m]; how far beyond stiction at rest [std]
     bool armed = false, held = false;            // it was within stiction; it alarmed by being beyond, and is still
     std::int64_t within_ns = 0;                  // when it last was
+    double level = 0.0;                          // steady, as it has been for a while [N m]
+    std::int64_t level_ns = 0;                   // when steady was last there
+    bool rested = false;                         // and the joint rested then
 
     /// The part of b that the model's errors may be.
     double stiction(double x) const noexcept { return std::clamp(x, center - bound, center + bound); }
+  };
+  /// What fades within a sample; exponentials cost as much as all else, and most periods are equal.
+  struct Decay {
+    double dt = 0.0, settle = 0.0, still = 0.0, back = 0.0, slow = 0.0, quick = 0.0, contact = 0.0, level = 0.0;
+    void of(double h, const ContactConfig& c) noexcept {
+      if (h == dt) return;
+      dt = h;
+      settle = std::exp(-h / c.settle_time);
+      still = -std::expm1(-h / c.rest_time);
+      back = -std::expm1(-h / c.model_time);
+      slow = -std::expm1(-2.0 * h / c.model_time);
+      quick = -std::expm1(-2.0 * h / c.rest_time);
+      contact = -std::expm1(-h / c.contact_time);
+      level = -std::expm1(-h / (10.0 * c.contact_time));
+    }
   };
   struct Measurement {
     JointVector z{}, input{}, beta{}, variance{}, slope{};  // variance of z
@@ -184,6 +205,10 @@ class ContactDetector {
       // A differentiated velocity is that of half a step ago, and so must be the torque.
       m.input[u(j)] = s.velocity_measured ? s.tau[u(j)] : 0.5 * (s.tau[u(j)] + tau_[u(j)]);
       m.slope[u(j)] = friction.derivative(s.dq[u(j)]);
+      if (friction.presliding > 0.0) {  // its sign goes with the travel, not with the noise of dq
+        const double sign = std::tanh(s.dq[u(j)] / friction.sign_velocity);
+        m.slope[u(j)] -= friction.level(s.dq[u(j)]) * (1.0 - sign * sign) / friction.sign_velocity;
+      }
       double sum = 0.0;
       for (int k = 0; k < n; ++k) sum += square(M_(j, k) * std::max(s.dq_std[u(k)], 1e-7));
       m.variance[u(j)] = sum;
@@ -247,12 +272,11 @@ class ContactDetector {
     J.dq = s.dq[u(j)];
     // What friction was loaded with at rest wears off with time, and no sooner than over the travel in which it turns over.
     const double kept = friction.presliding > 0.0 ? std::exp(-h * std::abs(s.dq[u(j)]) / friction.presliding) : 0.0;
-    J.rest = std::max(undirected ? 1.0 : 1.0 - square(std::tanh(s.dq[u(j)] / friction.sign_velocity)), J.rest * std::max(std::exp(-h / config_.settle_time), kept));
+    J.rest = std::max(undirected ? 1.0 : 1.0 - square(std::tanh(s.dq[u(j)] / friction.sign_velocity)), J.rest * std::max(decay_.settle, kept));
     const double V = model_variance(j, s, load, J.rest), V_rest = J.rest * rest_variance(j, s);
-    const double back = -std::expm1(-h * (J.rest / config_.rest_time + (1.0 - J.rest) / config_.model_time));
     const double turned = J.travel.step(friction, s.dq[u(j)], s.dq_std[u(j)]) * rest_variance(j, s);
-    const double slow = (V - V_rest) * -std::expm1(-2.0 * h / config_.model_time);
-    const double quick = undirected ? 4.0 * V_rest : V_rest * -std::expm1(-2.0 * h / config_.rest_time);
+    const double slow = (V - V_rest) * decay_.slow;
+    const double quick = undirected ? 4.0 * V_rest : V_rest * decay_.quick;
     J.bound = (1.0 - J.rest) * std::sqrt(3.0 * V) + J.rest * (std::sqrt(3.0 * V_rest) + 2.0 * std::sqrt(V - V_rest));
     const double dry = friction.level(s.dq[u(j)]) * std::tanh(s.dq[u(j)] / friction.sign_velocity);
     J.center = J.rest * (0.5 * (dry + J.dry) + s.friction_excess[u(j)]);  // the model's own, whatever noise of dq makes of either
@@ -262,7 +286,7 @@ class ContactDetector {
 
     // What acted in this step alone, and its low-pass: the contact's torque when there is one.
     const double now = momentum ? (z - J.z) / h - input : z;
-    const double a = -std::expm1(-h / config_.contact_time);
+    const double a = decay_.contact;
     J.fast += (elapsed_ > h ? a : 1.0) * (now - J.fast);
     J.fast_variance = a / (2.0 - a) * white + (momentum ? 2.0 * square(a / h) / (2.0 - a) * R : 0.0);
     J.z = z;
@@ -270,12 +294,14 @@ class ContactDetector {
     const double moved = now - J.center - J.steady;
     J.steady += elapsed_ < config_.warm_up ? (elapsed_ > h ? a : 1.0) * moved : a * std::clamp(moved, -most, most);
     J.beyond = J.rest > 0.9 ? std::max(0.0, std::abs(J.steady) - std::sqrt(3.0 * V_rest)) / std::sqrt(J.fast_variance + V - V_rest) : 0.0;
+    if (elapsed_ < config_.warm_up || std::abs(J.steady - J.level) < 3.0 * std::sqrt(J.fast_variance)) J.level_ns = s.time_ns, J.rested = J.rest > 0.5;
+    J.level += (elapsed_ < config_.warm_up ? 1.0 : decay_.level) * (J.steady - J.level);
     if (J.beyond < 3.0) J.held = false;
     if (J.beyond < 1.0) J.armed = elapsed_ >= config_.warm_up, J.within_ns = last_ns_;
 
     // Prediction and update of (p, b), or of b alone. Friction at rest is quick up to the bound, not beyond it.
     const double b_before = J.b;
-    J.b -= back * (J.b - J.stiction(J.b));
+    J.b -= (undirected ? decay_.still : decay_.back) * (J.b - J.stiction(J.b));
     if (momentum) J.p += h * (input + b_before);
     const double y = momentum ? z - J.p : z - J.b;
     const double off = J.b - J.center;
@@ -337,6 +363,7 @@ class ContactDetector {
       J.feels = alarm = true;
       if (!contact_.active) J.base = J.held ? J.center : J.rest > 0.5 ? J.stiction(first->b) : first->b;
       onset = std::min(onset, J.held ? J.within_ns : first->since_ns);
+      if (J.rested) onset = std::min(onset, J.level_ns);
     }
     if (alarm && !contact_.active) {
       contact_.active = true;
@@ -472,6 +499,7 @@ class ContactDetector {
   JointVector M_at_{}, beta_{}, tau_{};
   double mean_dt_ = 0.0, threshold_dt_ = 0.0, elapsed_ = 0.0;
   double most_beyond_ = 0.0;
+  Decay decay_{};
   std::array<double, 4> h_{};
   std::int64_t last_ns_ = 0, felt_ns_ = 0;
   bool known_ = false;

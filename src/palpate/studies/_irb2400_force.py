@@ -328,22 +328,27 @@ class Experiment:
     changed: list[tuple[float, Motion]]
 
 
-def experiment(plan: Plan, progress: Callable[[float], None]) -> Experiment:
-    """Simulate everything, then identify the robot from its own motion."""
-    arm = truth_arm()
-    drives, prior, sensors = truth_drives(arm), prior_arm(arm, 7), Sensors(11)
+def experiment(plan: Plan, progress: Callable[[float], None], fresh: int = 0) -> Experiment:
+    """Simulate everything, then identify the robot from its own motion.
+
+    Args:
+        fresh: 0 for the experiment by which settings were chosen; each other number is one with another prior, other
+            sensors, motions and pushes.
+    """
+    arm, seed = truth_arm(), 1000 * fresh
+    drives, prior, sensors = truth_drives(arm), prior_arm(arm, seed + 7), Sensors(seed + 11)
     held = with_load(arm, STATIC_LOAD, STATIC_PLACE)
-    static, holds, static_seconds = static_poses(plan.poses)
-    to_fit, fit_seconds = stop_and_go(2, plan.moves)
-    to_check, check_seconds = stop_and_go(3, plan.check)
+    static, holds, static_seconds = static_poses(seed + 5, plan.poses)
+    to_fit, fit_seconds = stop_and_go(seed + 2, plan.moves)
+    to_check, check_seconds = stop_and_go(seed + 3, plan.check)
     own = [
-        Run(arm, drives, excitation(1, plan.excitation, 0.15), plan.excitation),
+        Run(arm, drives, excitation(seed + 1, plan.excitation, 0.15), plan.excitation),
         Run(arm, drives, to_fit, fit_seconds),
         Run(arm, drives, to_check, check_seconds),
         Run(arm, drives, static, static_seconds),
         Run(held, drives, static, static_seconds),
     ]
-    records = [Run(arm, drives, there_and_back, SECONDS, pushes(20 + k)) for k in range(plan.records)]
+    records = [Run(arm, drives, there_and_back, SECONDS, pushes(seed + 20 + k)) for k in range(plan.records)]
     others = [Run(arm, drives, there_and_back, SECONDS)]
     for part in plan.changes:
         worn = replace(
@@ -352,7 +357,7 @@ def experiment(plan: Plan, progress: Callable[[float], None]) -> Experiment:
             static=(1.0 + part) * drives.static,
             viscous=(1.0 + part) * drives.viscous,
         )
-        others.append(Run(arm, worn, there_and_back, SECONDS, pushes(20)))
+        others.append(Run(arm, worn, there_and_back, SECONDS, pushes(seed + 20)))
     motions = simulate([*own, *records, *others], progress)
     robot = identify(prior, [sensors.read(m) for m in motions[: len(own)]], holds)
     after = motions[len(own) + len(records) :]

@@ -35,8 +35,8 @@ CHUNK = 300.0
 """of the campaign, one job [s]"""
 HOURS = 100.0
 """of the campaign, per arm"""
-ALARMS_PER_HOUR = 1e-3
-"""that the detector is asked for"""
+ALARMS_PER_HOUR = 3.55e-3
+"""that the detector is asked for: at this mean rate 100 h hold one alarm or none in 95 of 100 campaigns (Poisson)"""
 FASTEST = 1.5
 """of the simulated motion [rad/s]"""
 HARD = 37.5e3
