@@ -18,7 +18,8 @@ except ImportError:
 
 from .choice import COLOURS, Choice, choose, ink_colours
 from .ink import InkLayer, handwriting
-from .job import JobOptions, WipeJob
+from .job import WipeJob
+from .options import JobOptions
 from .reach import Reach, inverse_kinematics, reachable, tool_poses
 from .result import Event, JobResult, Look, Observer, Pass, Tick, Timing, Track
 from .scene import BoardScene, Setting
