@@ -156,26 +156,50 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
         return lambda: self._park(question.now, question.arm)
 
     def _strokes(self, question: ToStrokes) -> Route:
+        """The better way to lay the eraser first; the other one if the arm does not get everywhere."""
+        refused: Route | None = None
+        turned: bool | None = None
+        for turned in (None, True, False):
+            if refused is not None and refused.plan is not None and refused.plan.turned is turned:
+                continue
+            route = self._laid(question, turned)
+            if not route.reason:
+                return route
+            refused = refused or route
+        assert refused is not None
+        return refused
+
+    def _laid(self, question: ToStrokes, turned: bool | None) -> Route:
         now, size = question.now, self._scene.ink.size
         arm = self._scene.arms[0]
-        options = {"keep": question.keep, "eraser": self._eraser, "motion": self._motion}
-        strokes = plan(question.wipe, size, **options)  # type: ignore[arg-type]
+
+        def made(start: Array | None, turned: bool | None) -> Plan:
+            return plan(
+                question.wipe,
+                size,
+                keep=question.keep,
+                eraser=self._eraser,
+                motion=self._motion,
+                start=start,
+                turned=turned,
+            )
+
+        strokes = made(None, turned)
         if not strokes.strokes:
             return Route(plan=strokes)
         # the arm goes to the first stroke through the air, by its joints
-        strokes = plan(question.wipe, size, start=strokes.strokes[0][0], **options)  # type: ignore[arg-type]
+        strokes = made(strokes.strokes[0][0], strokes.turned)
         reach = reachable(arm, strokes, now.T_base_board)
         if not reach.ok:
             return Route(reason=f"the board is out of reach: {reach.reason}", plan=strokes)
-        legs = strokes.legs
         path = self._way(0, now, reach.q[0])
         if path is None:
             return Route(reason="there is no clear way for the arm to the board", plan=strokes)
-        number = itertools.accumulate((leg.phase == "touch" for leg in legs), initial=-1)
-        next(number)
+        legs = strokes.legs
+        number = itertools.accumulate(leg.phase == "touch" for leg in legs)
         work = Work(
             legs,
-            tuple(max(0, k) for k in number),
+            tuple(max(0, k - 1) for k in number),
             now.T_base_board,
             strokes.angle + reach.turn,
             size,
