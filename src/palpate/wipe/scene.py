@@ -48,7 +48,7 @@ MAGNET = (0.014, 0.009)
 """radius and height of a magnet [m]"""
 GRIP = 0.012
 """the gripper's point must be so near the board's rim to hold it [m]"""
-HOLDER = (1.5, 0.0, 0.0)
+HOLDER = (1.55, 0.0, 0.0)
 """base of the other arm, which faces the first [m]"""
 TICK_NS = 2_000_000
 """the ink is rubbed so often [ns]"""

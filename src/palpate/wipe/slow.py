@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -29,6 +30,10 @@ ABOVE = 0.06
 """height to which a tool is taken up before it goes away [m]"""
 BACK = 0.08
 """way of the gripper's fingers towards the rim [m]"""
+
+
+TURN = 0.6
+"""no joint turns further on such a short way, or the hand would leave it [rad]"""
 
 
 class Slow(Activity, Generic[Question, Answer]):
@@ -208,26 +213,29 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
         return Route((path,), plan=strokes, work=work)
 
     def _grip(self, now: Situation) -> Route:
-        """From above the rim that is nearest to the other arm, fingers a little inclined."""
-        arm, W = self._scene.arms[1], self._scene.ink.size[0]
+        """By a rim that is not the eraser's side, fingers a little inclined so that the hand stays off the table."""
+        arm, (W, H) = self._scene.arms[1], self._scene.ink.size
         T = self._scene.T_holder_base @ now.T_base_board
-        best: Route | None = None
-        for along, incline, side in itertools.product((0.5, 0.3, 0.7), (0.15, 0.0), (1.0, -1.0)):
-            c, s = np.cos(incline), np.sin(incline)
-            z, y = np.array([0.0, c, s]), side * np.array([0.0, -s, c])
+        out = np.array([0.0, 0.0, 1.0])
+        rims = [((a * W, -FRAME), (0.0, 1.0)) for a in (0.5, 0.3, 0.7)]
+        rims += [((W + FRAME, 0.3 * H), (-1.0, 0.0)), ((-FRAME, 0.3 * H), (1.0, 0.0))]
+        for (at, inward), incline, side in itertools.product(rims, (0.15, 0.0), (1.0, -1.0)):
+            c, s = math.cos(incline), math.sin(incline)
+            d = np.array([*inward, 0.0])
+            z, y = c * d + s * out, side * (c * out - s * d)
             grasp = np.eye(4)
             grasp[:3, :3] = np.stack((np.cross(y, z), y, z), axis=1)
-            grasp[:3, 3] = along * W, -FRAME, 0.5 * THICK
+            grasp[:3, 3] = *at, 0.5 * THICK
             before = grasp.copy()
             before[:3, 3] -= BACK * z
             q = inverse_kinematics(arm, T @ before, q=now.q[1])
             goal = None if q is None else inverse_kinematics(arm, T @ grasp, q=q)
-            if q is None or goal is None or float(np.abs(goal - q).max()) > 0.6:
+            if q is None or goal is None or float(np.abs(goal - q).max()) > TURN:
                 continue
             path = self._way(1, now, q)
-            if path is not None and (best is None or path.duration < best.paths[0].duration):
-                best = Route((path, Path((q, goal), 0.2)))
-        return best or Route(reason="the other arm cannot take the board: no grasp of its rim is in reach")
+            if path is not None:
+                return Route((path, Path((q, goal), 0.2)))
+        return Route(reason="the other arm cannot take the board: no grasp of its rim is in reach")
 
     def _park(self, now: Situation, which: int) -> Route:
         q, home = now.q[which], self._home[which]
@@ -240,13 +248,13 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
             up = T.copy()
             up[:3, 3] -= ABOVE * T_board[:3, 2]
             above = inverse_kinematics(arm, up, q=q)
-            if above is not None and float(np.abs(above - q).max()) < 0.6:
+            if above is not None and float(np.abs(above - q).max()) < TURN:
                 start, q = [Path((q, above), 0.4)], above
         elif which == 1:
             back = T.copy()
             back[:3, 3] -= BACK * T[:3, 2]
             away = inverse_kinematics(arm, back, q=q)
-            if away is not None and float(np.abs(away - q).max()) < 0.6:
+            if away is not None and float(np.abs(away - q).max()) < TURN:
                 start, q = [Path((q, away), 0.4)], away
         path = find(q, home, self._via(which, now, q), self._clearance(which, now))
         if path is None:
