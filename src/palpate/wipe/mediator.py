@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from statemachine import State, StateMachine
@@ -28,7 +28,7 @@ SURE = 0.8
 """confidence of a board from which its place is believed"""
 LOOKS = 3
 """pictures taken before no board is given up"""
-MOVED = 0.004
+MOVED = 0.008
 """a board that is seen so far from where it was has moved [m]"""
 SLIPPED = 0.002
 """the hand that holds the board has moved by so much [m]"""
@@ -40,12 +40,30 @@ CALM_NS = 400_000_000
 """at rest after a fault before anything moves; a channel must be well for so long [ns]"""
 
 # what moves a heavy arm well with 5 N; see docs/wiping.md
-ABAG = AbagParameters(
-    alpha=0.5, theta_b=0.0, delta_b=0.003, theta_g=0.5, delta_g=0.008, period=0.004, band=0.05, least_gain=0.6
-)
-ABAG_TURNING = AbagParameters(
-    alpha=0.5, theta_b=0.0, delta_b=8e-4, theta_g=1.0, delta_g=0.008, period=0.004, band=0.15, least_gain=0.6
-)
+GAINS: Mapping[str, Any] = {
+    "abag": AbagParameters(
+        alpha=0.5,
+        theta_b=0.0,
+        delta_b=0.003,
+        theta_g=0.5,
+        delta_g=0.008,
+        period=0.004,
+        band=0.05,
+        least_gain=0.6,
+    ),
+    "abag_turning": AbagParameters(
+        alpha=0.5,
+        theta_b=0.0,
+        delta_b=8e-4,
+        theta_g=1.0,
+        delta_g=0.008,
+        period=0.004,
+        band=0.15,
+        least_gain=0.6,
+    ),
+    "turning": 8.0,
+    "approach": 5.0,
+}
 
 Cause: TypeAlias = Literal["", "torque", "contact", "hand", "other"]
 
@@ -410,14 +428,7 @@ class Mediator(Activity):
         controller = CartesianVelocity(
             self._others.arms[0],
             self._others.control.period_ns * 1e-9,
-            CartesianVelocityOptions(
-                abag=ABAG,
-                abag_turning=ABAG_TURNING,
-                turning=8.0,
-                approach=5.0,
-                max_force=o.max_force,
-                max_torque=o.max_torque,
-            ),
+            CartesianVelocityOptions(**GAINS, max_force=o.max_force, max_torque=o.max_torque),
         )
         self.wipe = Wipe(self._others.arms[0], controller, route.work, o.normal_force)
         self._go("wipe")
