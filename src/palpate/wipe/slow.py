@@ -28,6 +28,8 @@ Answer = TypeVar("Answer")
 
 ABOVE = 0.06
 """height to which a tool is taken up before it goes away [m]"""
+MARGIN = 0.008
+"""wiped around what is seen to be dirty: the eye may be off by 4 mm, the tool by as much [m]"""
 BACK = 0.08
 """way of the gripper's fingers towards the rim [m]"""
 
@@ -187,6 +189,7 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
                 motion=self._motion,
                 start=start,
                 turned=turned,
+                margin=MARGIN,
             )
 
         strokes = made(None, turned)

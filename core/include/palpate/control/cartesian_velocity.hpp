@@ -107,7 +107,7 @@ struct CartesianCommand {
 /// An arm's inertia couples: a force in the plane alone lifts and tips the tool. With A = J M^-1 J^T, the tool's accelerations per wrench,
 /// the normal force and the torque get beside them F_c, T_c from
 ///   A_nn F_c + A_nw T_c = -A_np F_p - A_nw T,   A_wn F_c + A_ww T_c = -A_wp F_p,
-/// F_p the force in the plane, so that nothing of F_p and T is left in the normal direction and nothing of F_p in turning; and
+/// F_p the force in the plane, the surface's friction with it, so that nothing of F_p and T is left in the normal direction and nothing of F_p in turning; and
 /// -J^T A^-1 J'q', bounded as F and T are, takes away what the tool accelerates by the arm's own speed (part of the Coriolis
 /// compensation, not of F and T). F and T with what is added keep their bounds.
 ///
@@ -198,7 +198,7 @@ class CartesianVelocity {
         wanted.z = 0.0;
         double F_n = normal_force(target.normal_force, f.z, v.z);
         F = bounded(c_.max_force * Vec3<double>{axis(0, wanted.x - v.x), axis(1, wanted.y - v.y), 0.0}, left_in_plane(F_n));
-        if (c_.decoupled) decouple(dynamics, A * F, A.cz, F_n, T);
+        if (c_.decoupled) decouple(dynamics, A * Vec3<double>{F.x + f.x, F.y + f.y, 0.0}, A.cz, F_n, T);
         F = bounded(F, left_in_plane(F_n));
         F.z = F_n;
         F = bounded(F, c_.max_force);
