@@ -93,6 +93,7 @@ void bind_cartesian(nb::module_& m) {
                   {"touch_speed", &C::touch_speed, "towards a surface not yet felt [m/s]"},
                   {"force_p", &C::force_p, "of the normal force's error [1]"},
                   {"force_i", &C::force_i, "of its integral [1/s]"},
+                  {"decoupled", &C::decoupled, "while pressing, what moves the tool in the plane neither presses nor tips it"},
                   {"yield_force", &C::yield_force, "a push beyond this makes the arm yield [N]; infinity: never"},
                   {"yield_time", &C::yield_time, "after a push, until the task goes on [s]"},
                   {"free_speed", &C::free_speed, "the brake acts beyond this, and beyond 1.5 times the wanted speed [m/s]"},

@@ -32,6 +32,8 @@ THING = 0.016
 """half width from which a filled piece is a thing rather than a stroke, relative to the board's shorter side"""
 DARK = 0.5
 """a thing wider than a stroke takes away this part of the light at least, in one colour: no shadow is so deep"""
+PALE = 0.25
+"""a wide piece inside the board that takes away less of the light than this is a smudge, not a thing"""
 SPECK = 9
 """smallest connected piece [pixels]"""
 
@@ -195,7 +197,8 @@ def _pieces(
     mass = np.cumsum(area[drawn])
     pen = float(radius[drawn[np.searchsorted(mass, 0.5 * mass[-1])]]) if len(drawn) else 0.0
     # a magnet, a sticker, an eraser, a hand: as wide as no stroke, and filled or reaching in from outside
-    thing = (radius > np.maximum(wide, 1.8 * pen)) & ((filled > 0.9) | (nearest < margin + 3.0))
+    bold = (filled > 0.9) & (strength > PALE)
+    thing = (radius > np.maximum(wide, 1.8 * pen)) & (bold | (nearest < margin + 3.0))
     polygons, objects, contrast = [], [], []
     for i, (piece, line) in outlines.items():
         if thing[i]:

@@ -18,7 +18,10 @@ except ImportError:
 
 from .choice import COLOURS, Choice, choose, ink_colours
 from .ink import InkLayer, handwriting
+from .job import WipeJob
+from .options import JobOptions
 from .reach import Reach, inverse_kinematics, reachable, tool_poses
+from .result import Event, JobResult, Look, Observer, Pass, Tick, Timing, Track
 from .scene import BoardScene, Setting
 from .strokes import Eraser, Leg, Motion, Phase, Plan, plan, swept
 
@@ -27,13 +30,23 @@ __all__ = [
     "BoardScene",
     "Choice",
     "Eraser",
+    "Event",
     "InkLayer",
+    "JobOptions",
+    "JobResult",
     "Leg",
+    "Look",
     "Motion",
+    "Observer",
+    "Pass",
     "Phase",
     "Plan",
     "Reach",
     "Setting",
+    "Tick",
+    "Timing",
+    "Track",
+    "WipeJob",
     "choose",
     "handwriting",
     "ink_colours",

@@ -62,6 +62,8 @@ class InkLayer:
     """(H, W) work that takes one layer off [J/m^2]"""
     colour: npt.NDArray[np.uint8] = field(init=False)
     """(H, W, 3) of the ink, red green blue"""
+    work: Texture = field(init=False)
+    """(H, W) that felt has done on the surface so far [J/m^2]"""
 
     def __post_init__(self) -> None:
         for value in (*self.size, self.texel):
@@ -73,6 +75,7 @@ class InkLayer:
         self.amount = np.zeros((h, w), np.float32)
         self.toughness = np.full((h, w), FRESH, np.float32)
         self.colour = np.full((h, w, 3), WHITE, np.uint8)
+        self.work = np.zeros((h, w), np.float32)
 
     # -- putting ink on --------------------------------------------------------
 
@@ -283,7 +286,9 @@ class InkLayer:
         way = np.hypot(d[0] - turn * dy, d[1] + turn * dx)
         part = np.s_[low[1] : high[1], low[0] : high[0]]
         old = self.amount[part]
-        gone = np.minimum(old, (here * way / self.toughness[part]).astype(np.float32))
+        done = (here * way).astype(np.float32)
+        self.work[part] += done
+        gone = np.minimum(old, done / self.toughness[part])
         self.amount[part] = old - gone
         return float(gone.sum(dtype=np.float64)) * self.texel**2
 

@@ -48,7 +48,7 @@ MAGNET = (0.014, 0.009)
 """radius and height of a magnet [m]"""
 GRIP = 0.012
 """the gripper's point must be so near the board's rim to hold it [m]"""
-HOLDER = (1.5, 0.0, 0.0)
+HOLDER = (1.55, 0.0, 0.0)
 """base of the other arm, which faces the first [m]"""
 TICK_NS = 2_000_000
 """the ink is rubbed so often [ns]"""
@@ -142,10 +142,20 @@ class BoardScene:
         at = model.joint(f"holder:{self.arms[1].joints[0].name}")
         self._second = slice(at.qposadr[0], at.qposadr[0] + n), slice(at.dofadr[0], at.dofadr[0] + n)
         self._pads = np.array([model.geom(f"pad:{k}").id for k in range(PADS[0] * PADS[1])])
+        self._pad_of = np.full(model.ngeom, -1)
+        self._pad_of[self._pads] = np.arange(len(self._pads))
         self._grip = model.equality("grip").id
         self._hand = model.body("holder:payload").id
         self._tool = model.body("arm:payload").id
         self._texture = model.texture("ink").id
+        self._solids = (
+            self._shapes("arm:"),
+            self._shapes("holder:"),
+            [model.geom("table").id, model.geom("board").id],
+        )
+        self._mirror: Any = None
+        self.torque_lost = False
+        """set it: the joint torque sensors of the eraser's arm say nothing any more"""
         self._lens: _Lens | None = None
         self._rng = np.random.default_rng(self.setting.seed)
         self._rubbed: tuple[Array, float] | None = None
@@ -227,7 +237,12 @@ class BoardScene:
     def T_base_board(self, arm: int) -> Array:
         """As :attr:`T_world_board`, in the base frame of arm 0 (eraser) or 1 (holder)."""
         T = self.T_world_board
-        return T if arm == 0 else np.linalg.inv(_holder_base()) @ T
+        return T if arm == 0 else self.T_holder_base @ T
+
+    @property
+    def T_holder_base(self) -> Array:
+        """(4, 4) from the base of the eraser's arm to that of the holder's."""
+        return np.linalg.inv(_holder_base())
 
     @property
     def pad_forces(self) -> Array:
@@ -243,14 +258,14 @@ class BoardScene:
         d, model = self._plant.data, self._plant.model
         normal, total = np.zeros(len(self._pads)), np.zeros(3)
         wrench = np.empty(6)
-        pairs = d.contact.geom
-        for k in np.flatnonzero(np.isin(pairs, self._pads).any(1)) if len(pairs) else ():
+        pads = self._pad_of[d.contact.geom]  # (contacts, 2)
+        for k in np.flatnonzero((pads >= 0).any(1)) if len(pads) else ():
             self._mj.mj_contactForce(model, d, int(k), wrench)
             # the contact's x axis points from the first geom to the second, on which the force acts
             R = d.contact.frame[k].reshape(3, 3)
-            second = bool(np.isin(pairs[k, 1], self._pads))
+            second = bool(pads[k, 1] >= 0)
             total += (1.0 if second else -1.0) * (R.T @ wrench[:3])
-            normal[self._pads == pairs[k, int(second)]] += wrench[0]
+            normal[pads[k, int(second)]] += wrench[0]
         return normal.reshape(PADS), total
 
     def _rub(self) -> None:
@@ -274,6 +289,41 @@ class BoardScene:
                 turn,
             )
         self._rubbed = face[:2], angle
+
+    def clearance(
+        self, arm: int, q: npt.ArrayLike, q_other: npt.ArrayLike, T_world_board: npt.ArrayLike
+    ) -> float:
+        """How near an arm would be to table, board, floor and the other arm [m]; at most 0.1, < 0: within them.
+
+        Args:
+            arm: 0 the eraser's, 1 the holder's.
+            q: (n,) of that arm [rad].
+            q_other: (n,) of the other [rad].
+            T_world_board: (4, 4) where the board is taken to be.
+        """
+        mj, model = self._mj, self._plant.model
+        if self._mirror is None:
+            self._mirror = mj.MjData(model)
+        d, far = self._mirror, 0.1
+        first, second = (q, q_other) if arm == 0 else (q_other, q)
+        d.qpos[: self.arms[0].n], d.qpos[self._second[0]] = first, second
+        T = np.asarray(T_world_board, dtype=np.float64)
+        d.qpos[self._joint : self._joint + 3] = T[:3, 3] + T[:3, :3] @ [
+            0.5 * self.ink.size[0],
+            0.5 * self.ink.size[1],
+            0.0,
+        ]
+        d.qpos[self._joint + 3 : self._joint + 7] = _model.quaternion(T[:3, :3])
+        mj.mj_kinematics(model, d)
+        own, others = self._solids[arm], (*self._solids[1 - arm], *self._solids[2])
+        radius, at = model.geom_rbound, d.geom_xpos
+        least = far
+        for a in own:
+            least = min(least, float(at[a, 2]) - 0.08)  # the floor; no link is thicker than that
+            for b in others:
+                if float(np.linalg.norm(at[a] - at[b])) < radius[a] + radius[b] + least:
+                    least = min(least, mj.mj_geomDistance(model, d, int(a), int(b), least, None))
+        return least
 
     # -- what people and hands do ----------------------------------------------
 
@@ -328,6 +378,59 @@ class BoardScene:
             raise InputError(f"a shove must be a finite force (3,) [N], got {push.shape}")
         self._plant.data.xfrc_applied[self._board, :3] = push
 
+    def push(self, force: npt.ArrayLike) -> None:
+        """Push the eraser's arm at its hand by a force (3,), world axes [N], from now on; zero ends it.
+
+        Raises:
+            InputError: a wrong shape.
+        """
+        value = np.asarray(force, dtype=np.float64)
+        if value.shape != (3,) or not np.all(np.isfinite(value)):
+            raise InputError(f"a push must be a finite force (3,) [N], got {value.shape}")
+        d = self._plant.data
+        # at the eraser's face, so that it does not turn the tool
+        lever = d.xmat[self._tool].reshape(3, 3) @ [0.0, 0.0, STEM]
+        d.xfrc_applied[self._tool] = (
+            *value,
+            *np.cross(lever + d.xpos[self._tool] - d.xipos[self._tool], value),
+        )
+
+    def lose_eraser(self) -> None:
+        """The felt comes off the hand; nothing of it touches anything from now on."""
+        self._plant.model.geom_contype[self._pads] = 0
+        self._refresh()
+
+    def find_eraser(self) -> None:
+        """It is put back."""
+        self._plant.model.geom_contype[self._pads] = 2
+        self._refresh()
+
+    def carry_board(self, move: npt.ArrayLike, turn: float = 0.0) -> None:
+        """Somebody takes the board and puts it down elsewhere: by `move` (3,) [m] and `turn` [rad] about its normal.
+
+        Raises:
+            InputError: a wrong shape.
+        """
+        way = np.asarray(move, dtype=np.float64)
+        if way.shape != (3,) or not np.all(np.isfinite(way)):
+            raise InputError(f"a move must be finite and (3,) [m], got {way.shape}")
+        d, at = self._plant.data, self._joint
+        d.qpos[at : at + 3] += way
+        spin = np.empty(4)
+        self._mj.mju_mulQuat(
+            spin, d.qpos[at + 3 : at + 7], [math.cos(0.5 * turn), 0.0, 0.0, math.sin(0.5 * turn)]
+        )
+        d.qpos[at + 3 : at + 7] = spin
+        start = self._plant.model.joint("board").dofadr[0]
+        d.qvel[start : start + 6] = 0.0
+        self.open_grip()
+
+    def _refresh(self) -> None:
+        """What MuJoCo asks of a body before it looks at its shapes."""
+        model = self._plant.model
+        for pad in self._pads:
+            model.body_contype[model.geom_bodyid[pad]] = model.geom_contype[pad]
+
     # -- the camera ------------------------------------------------------------
 
     @property
@@ -371,6 +474,25 @@ class BoardScene:
             self._lens.close()
             self._lens = None
         self._plant.close()
+
+    def _shapes(self, prefix: str) -> list[int]:
+        """Geoms of an arm that move with its second joint or a later one, and of what its hand holds."""
+        model = self._plant.model
+        body = model.body(f"{prefix}{self.arms[0].joints[1].link}").id
+        found = []
+        for g in range(model.ngeom):
+            at = model.geom_bodyid[g]
+            if (
+                model.body(at).name.startswith("pad:")
+                or model.geom_size[g].max() <= 0.0
+                or model.geom_rgba[g, 3] == 0.0
+            ):
+                continue
+            while at not in (0, body):
+                at = model.body_parentid[at]
+            if at == body:
+                found.append(g)
+        return found
 
     # -- building --------------------------------------------------------------
 
@@ -543,8 +665,8 @@ class BoardScene:
         for side in (-1.0, 1.0):
             self._other.payload.add_geom(
                 type=box,
-                size=(0.012, 0.004, 0.5 * STEM),
-                pos=(0.0, side * (0.5 * THICK + 0.006), 0.5 * STEM),
+                size=(0.012, 0.003, 0.5 * STEM),
+                pos=(0.0, side * (0.5 * THICK + 0.0035), 0.5 * STEM),
                 rgba=(0.3, 0.3, 0.32, 1.0),
                 mass=0,
                 **ghost,

@@ -195,6 +195,7 @@ def plan(
     eraser: Eraser | None = None,
     motion: Motion | None = None,
     start: npt.ArrayLike | None = None,
+    turned: bool | None = None,
     margin: float = 0.004,
     clearance: float = 0.003,
 ) -> Plan:
@@ -208,6 +209,7 @@ def plan(
         eraser: None: felt of 50 mm by 110 mm.
         motion: None: 0.1 m/s.
         start: (2,) over which place the tool is; None: over the board's middle.
+        turned: the eraser's width is to lie along the board's y (True) or x (False); None: as is better.
         margin: so much around the dirt is wiped too, for what the eye and the arm are off [m].
         clearance: the eraser keeps so far from what it must not touch [m].
 
@@ -228,9 +230,9 @@ def plan(
     nogo = shapely.union_all([shape(p, "keep") for p in keep]).buffer(clearance, join_style="mitre")
     soiled = soiled.buffer(max(margin, _HAIR)).intersection(board).difference(nogo)
     choices = [
-        (turned, *_cover(soiled, nogo, (W, H), _footprint(eraser, turned), eraser, first))
-        for turned in (False, True)
-        if all(f <= s + _HAIR for f, s in zip(_footprint(eraser, turned), (W, H), strict=True))
+        (way, *_cover(soiled, nogo, (W, H), _footprint(eraser, way), eraser, first))
+        for way in ((False, True) if turned is None else (turned,))
+        if all(f <= s + _HAIR for f, s in zip(_footprint(eraser, way), (W, H), strict=True))
         for first in (0, 1)
     ]
     if not choices:
@@ -240,14 +242,14 @@ def plan(
     # a lift and a touch cost about as much as this way of sliding
     lift = 2.0 * (motion.lift / motion.approach + motion.approach / motion.acceleration) * motion.speed
     least = min(left.area for _, _, left in choices)
-    turned, lines, left = min(
+    best, lines, left = min(
         (c for c in choices if c[2].area <= least + 1e-6),
         key=lambda c: sum(float(np.linalg.norm(b - a)) + lift for a, b in c[1]),
     )
     way = _tour.order(np.array(lines).reshape(-1, 2, 2), at)
     ordered = [lines[i][::-1] if backwards else lines[i] for i, backwards in way]
-    strokes = _joined(ordered, nogo, _footprint(eraser, turned), motion)
-    return Plan((W, H), eraser, turned, motion, strokes, tuple(outlines(left)), at)
+    strokes = _joined(ordered, nogo, _footprint(eraser, best), motion)
+    return Plan((W, H), eraser, best, motion, strokes, tuple(outlines(left)), at)
 
 
 def _cover(

@@ -38,6 +38,7 @@ struct CartesianVelocityConfig {
   double touch_speed = 0.02;        ///< towards a surface not yet felt, and at most away from it [m/s], > 0
   double force_p = 0.3;             ///< of the normal force's error [1], >= 0
   double force_i = 2.0;             ///< of its integral [1/s], >= 0
+  bool decoupled = true;            ///< while pressing: what moves the tool in the plane neither presses nor tips it
   double yield_force = 12.0;        ///< a push beyond this, the expected contact taken away, makes the arm yield [N], > 0; infinity: never
   double yield_time = 0.3;          ///< after a push, until the task goes on [s], >= 0
   double free_speed = 0.4;          ///< beyond this, and beyond 1.5 times the wanted speed, the brake acts [m/s], > 0
@@ -54,6 +55,7 @@ struct CartesianVelocityConfig {
     c.abag = c.abag_turning = AbagParameters::whiteboard();
     c.yield_force = std::numeric_limits<double>::infinity();
     c.brake = c.brake_turning = 0.0;
+    c.decoupled = false;
     c.errata = {true, false, true, true, true};
     return c;
   }
@@ -101,6 +103,13 @@ struct CartesianCommand {
 /// f the force of the surface on the tool by the sensorless estimate. The last term lets the tool approach a surface it does not
 /// feel at touch_speed and brakes it if it comes faster; nothing is integrated before the surface is felt. The plane gets what the
 /// bound leaves: sqrt(F_max^2 - F_n^2). Without an estimate that may be believed nothing is pressed and nothing moves (status held).
+///
+/// An arm's inertia couples: a force in the plane alone lifts and tips the tool. With A = J M^-1 J^T, the tool's accelerations per wrench,
+/// the normal force and the torque get beside them F_c, T_c from
+///   A_nn F_c + A_nw T_c = -A_np F_p - A_nw T,   A_wn F_c + A_ww T_c = -A_wp F_p,
+/// F_p the force in the plane, the surface's friction with it, so that nothing of F_p and T is left in the normal direction and nothing of F_p in turning; and
+/// -J^T A^-1 J'q', bounded as F and T are, takes away what the tool accelerates by the arm's own speed (part of the Coriolis
+/// compensation, not of F and T). F and T with what is added keep their bounds.
 ///
 /// A push (external force beyond yield_force, the contact's own force taken away) makes the arm yield: ABAGs and integral are
 /// cleared and F = 0 until it has been gone for yield_time. The tool keeps its orientation.
@@ -179,6 +188,7 @@ class CartesianVelocity {
     out.distance = std::sqrt(dot(in_plane, in_plane));
     out.arrived = out.distance <= c_.arrived;
     if (blind) rest();
+    if (!blind) T = turning(target, tool, dynamics);
     if (out.yielding || blind) {
       for (Abag& a : along_) a.reset();
       integral_ = 0.0;
@@ -186,9 +196,10 @@ class CartesianVelocity {
       wanted = lead + wanted_velocity(in_plane, out.distance, target.speed, dot(lead, lead) == 0.0);
       if (pressing) {
         wanted.z = 0.0;
-        const double F_n = normal_force(target.normal_force, f.z, v.z);
-        const double left = std::sqrt(std::max(0.0, c_.max_force * c_.max_force - F_n * F_n));
-        F = bounded(c_.max_force * Vec3<double>{axis(0, wanted.x - v.x), axis(1, wanted.y - v.y), 0.0}, left);
+        double F_n = normal_force(target.normal_force, f.z, v.z);
+        F = bounded(c_.max_force * Vec3<double>{axis(0, wanted.x - v.x), axis(1, wanted.y - v.y), 0.0}, left_in_plane(F_n));
+        if (c_.decoupled) decouple(dynamics, A * Vec3<double>{F.x + f.x, F.y + f.y, 0.0}, A.cz, F_n, T);
+        F = bounded(F, left_in_plane(F_n));
         F.z = F_n;
         F = bounded(F, c_.max_force);
       } else if (c_.axes == VelocityAxes::heading) {
@@ -198,7 +209,6 @@ class CartesianVelocity {
         if (!c_.errata.axis_bound) F = bounded(F, c_.max_force);
       }
     }
-    if (!blind) T = turning(target, tool, dynamics);
     const Vec3<double> F_base = c_.errata.axis_bound ? A * F : bounded(A * F, c_.max_force);
     put(out.force, F_base), put(out.torque, T), put(out.velocity, tool.v), put(out.wanted, A * wanted);
     const double free_speed = out.yielding || blind ? 0.0 : std::max(c_.free_speed, 1.5 * (target.speed + std::sqrt(dot(lead, lead))));
@@ -210,6 +220,7 @@ class CartesianVelocity {
     const JointVector posture = posture_.torque(tool, dynamics, q, dq);
     for (std::size_t j = 0; j < n; ++j) tau[j] += friction[j] + posture[j];
     tool.add_wrench((c_.errata.turned_twice ? tool.R * (tool.R * F_base) : F_base) + D, T + dynamics.turning(D_turning), arm_->n(), tau);
+    if (pressing && c_.decoupled) straighten(tool, dynamics, tau);
     if (!check::all_finite(tau, n)) {
       out.joints.torque = holding_;
       out.joints.status = Status::non_finite;
@@ -295,6 +306,43 @@ class CartesianVelocity {
     if (f > 0.3 * wanted) integral_ = std::clamp(integral_ + c_.force_i * h_ * error, -0.5 * wanted, 0.5 * wanted);
     const double feedback = f > 0.3 * wanted ? c_.force_p * error : 0.0;
     return std::clamp(-(wanted + feedback + integral_) - wanted / c_.touch_speed * v, -c_.max_force, c_.max_force);
+  }
+
+  [[nodiscard]] double left_in_plane(double F_n) const noexcept { return std::sqrt(std::max(0.0, c_.max_force * c_.max_force - F_n * F_n)); }
+
+  /// Adds F_c to F_n along n and T_c to T, see above; F_p in base axes. Both stay as they were where the arm cannot move every way.
+  void decouple(const TaskDynamics& dynamics, const Vec3<double>& F_p, const Vec3<double>& n, double& F_n, Vec3<double>& T) const noexcept {
+    const std::array<double, 6> normal{n.x, n.y, n.z, 0, 0, 0}, plane{F_p.x, F_p.y, F_p.z, 0, 0, 0}, turn{0, 0, 0, T.x, T.y, T.z};
+    std::array<double, 6> by_normal{}, by_plane{}, by_turn{};
+    for (int r = 0; r < 6; ++r)
+      for (int c = 0; c < 6; ++c) {
+        const auto u = detail::at(r), k = detail::at(c);
+        by_normal[u] += dynamics.A(r, c) * normal[k], by_plane[u] += dynamics.A(r, c) * plane[k], by_turn[u] += dynamics.A(r, c) * turn[k];
+      }
+    const auto along = [&normal](const std::array<double, 6>& a) { return a[0] * normal[0] + a[1] * normal[1] + a[2] * normal[2]; };
+    JointMatrix M{};
+    JointVector b{};
+    M(0, 0) = along(by_normal);
+    b[0] = -along(by_plane) - along(by_turn);
+    for (int r = 0; r < 3; ++r) {
+      M(0, r + 1) = M(r + 1, 0) = by_normal[detail::at(r + 3)];
+      for (int c = 0; c < 3; ++c) M(r + 1, c + 1) = dynamics.A(r + 3, c + 3);
+      b[detail::at(r + 1)] = -by_plane[detail::at(r + 3)];
+    }
+    const Cholesky<double> factor(M, 4);
+    if (!dynamics.good || !factor.positive()) return;
+    const JointVector x = factor.solve(b);
+    if (!check::all_finite(x, 4)) return;
+    F_n = std::clamp(F_n + x[0], -c_.max_force, c_.max_force);
+    T = bounded(T + Vec3<double>{x[1], x[2], x[3]}, c_.max_torque);
+  }
+
+  /// tau -= J^T A^-1 J'q'.
+  void straighten(const ToolState& tool, const TaskDynamics& dynamics, JointVector& tau) const noexcept {
+    const Cholesky<double> factor(dynamics.A, 6);
+    if (!dynamics.good || !factor.positive()) return;
+    const JointVector x = factor.solve({tool.dv.x, tool.dv.y, tool.dv.z, tool.dw.x, tool.dw.y, tool.dw.z});
+    tool.add_wrench(bounded({-x[0], -x[1], -x[2]}, c_.max_force), bounded({-x[3], -x[4], -x[5]}, c_.max_torque), arm_->n(), tau);
   }
 
   /// Somebody pushes, or did a moment ago. f in task axes.

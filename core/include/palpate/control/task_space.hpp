@@ -50,16 +50,21 @@ struct ToolState {
   Vec3<double> x;             ///< [m]
   Mat3<double> R;             ///< R_base_tip
   Vec3<double> v, w;          ///< velocity [m/s], angular velocity [rad/s]
+  Vec3<double> dv, dw;        ///< J' q': what the tool accelerates while no joint does [m/s^2, rad/s^2]
   Joints<Vec3<double>> Jv, Jw;  ///< columns of the Jacobian [m, 1]
 
   ToolState(const Arm& arm, const JointVector& q, const JointVector& dq) noexcept
-      : chain(forward_kinematics<double>(arm, q)), x(chain.p + chain.R * arm.p_last_grasp()), R(chain.R * arm.R_last_tip()), v{}, w{}, Jv{}, Jw{} {
+      : chain(forward_kinematics<double>(arm, q)), x(chain.p + chain.R * arm.p_last_grasp()), R(chain.R * arm.R_last_tip()), v{}, w{}, dv{}, dw{}, Jv{}, Jw{} {
     for (int j = 0; j < arm.n(); ++j) {
       const auto u = detail::at(j);
       Jv[u] = jacobian_column(arm, chain, j, x);
       Jw[u] = arm.body(j).prismatic ? Vec3<double>{} : chain.axis[u];
-      v = v + dq[u] * Jv[u];
-      w = w + dq[u] * Jw[u];
+      // dJ_v,j/dq_k = J_w,min(j,k) x J_v,max(j,k),  dJ_w,j/dq_k = J_w,k x J_w,j for k < j
+      const Vec3<double> step = dq[u] * Jv[u], turn = dq[u] * Jw[u];
+      dv = dv + cross(2.0 * w + turn, step);
+      dw = dw + cross(w, turn);
+      v = v + step;
+      w = w + turn;
     }
   }
 

@@ -1,0 +1,517 @@
+"""The mediator: which activity does what next, and what is done when something goes wrong."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from statemachine import State, StateMachine
+
+from .. import vision
+from .._core import AbagParameters, CartesianVelocityOptions
+from ..arm import Arm, Array
+from ..control import CartesianVelocity
+from .activity import Activity, Slot
+from .choice import Choice, choose, ink_colours
+from .fast import Control, Estimation, Follow, Hold, Law, Robot, Wipe
+from .motion import Path
+from .options import JobOptions
+from .result import Kind, Look, Verdict
+from .slow import Navigation, Perception, Route, Situation, ToGrip, ToPark, ToStrokes
+from .strokes import Plan
+
+SURE = 0.8
+"""confidence of a board from which its place is believed"""
+LOOKS = 3
+"""pictures taken before no board is given up"""
+MOVED = 0.008
+"""a board that is seen so far from where it was has moved [m]"""
+SLIPPED = 0.002
+"""the hand that holds the board has moved by so much [m]"""
+AGREE = 4.0
+"""corners of the board where it was expected, and a board found: they are the same within [pixel]"""
+PATIENCE_NS = 2_000_000_000
+"""for a torque channel to come back [ns]"""
+CALM_NS = 400_000_000
+"""at rest after a fault before anything moves; a channel must be well for so long [ns]"""
+
+# what moves a heavy arm well with 5 N; see docs/wiping.md
+GAINS: Mapping[str, Any] = {
+    "abag": AbagParameters(
+        alpha=0.5,
+        theta_b=0.0,
+        delta_b=0.003,
+        theta_g=0.5,
+        delta_g=0.008,
+        period=0.004,
+        band=0.05,
+        least_gain=0.6,
+    ),
+    "abag_turning": AbagParameters(
+        alpha=0.5,
+        theta_b=0.0,
+        delta_b=8e-4,
+        theta_g=1.0,
+        delta_g=0.008,
+        period=0.004,
+        band=0.15,
+        least_gain=0.6,
+    ),
+    "turning": 8.0,
+    "approach": 5.0,
+}
+
+Cause: TypeAlias = Literal["", "torque", "contact", "hand", "other"]
+
+
+class Mission(StateMachine):
+    """What the job does now; every way between two of these is one of the events."""
+
+    parking = State(initial=True)
+    looking = State()
+    holding = State()
+    planning = State()
+    moving = State()
+    wiping = State()
+    safe = State()
+    releasing = State()
+    ended = State(final=True)
+
+    look = parking.to(looking) | holding.to(looking)
+    hold = looking.to(holding)
+    think = looking.to(planning) | holding.to(planning)
+    move = planning.to(moving)
+    wipe = moving.to(wiping) | safe.to(wiping)
+    park = wiping.to(parking) | safe.to(parking) | moving.to(parking)
+    fail = (
+        parking.to(safe)
+        | looking.to(safe)
+        | holding.to(safe)
+        | planning.to(safe)
+        | moving.to(safe)
+        | wiping.to(safe)
+    )
+    release = looking.to(releasing) | planning.to(releasing)
+    end = (
+        looking.to(ended)
+        | planning.to(ended)
+        | holding.to(ended)
+        | safe.to(ended)
+        | releasing.to(ended)
+        | parking.to(ended)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Others:
+    """The activities that the mediator tells what to do, and what it knows of the cell."""
+
+    arms: tuple[Arm, Arm]
+    robot: Robot
+    estimation: Estimation
+    control: Control
+    perception: Perception
+    navigation: Navigation
+    nominal: Array
+    """(4, 4) where boards usually lie, in the eraser's base [m]"""
+    camera: vision.Camera
+    size: tuple[float, float]
+    """of the board [m]"""
+
+    def displacement(self, look: Look, expected: Array) -> float | None:
+        """How far the board is from where it is expected [m]; None: an arm in front of it hides that."""
+        W, H = self.size
+        corners = np.array([[0.0, 0.0, 0.0, 1.0], [W, 0.0, 0.0, 1.0], [W, H, 0.0, 1.0], [0.0, H, 0.0, 1.0]])
+        assert self.camera.T_base_camera is not None
+        lens = np.linalg.inv(self.camera.T_base_camera) @ expected
+        pixels = self.camera.project((corners @ lens.T)[:, :3])
+        boards = look.sight.boards
+        if any(float(np.linalg.norm(b.corners - pixels, axis=1).max()) < AGREE for b in boards):
+            return 0.0
+        if not boards or boards[0].confidence < SURE or not boards[0].complete or look.sight.plane is None:
+            return None
+        seen = look.sight.plane.T_base_board
+        assert seen is not None
+        return float(np.linalg.norm(seen[:3, 3] - expected[:3, 3]))
+
+
+class Mediator(Activity):
+    """Sees to it that a board gets clean.
+
+    Args:
+        period_ns: of its cycles [ns].
+        options: of the job.
+        others: the activities it tells what to do.
+        tell: called with what happened.
+        number: passes that were made before.
+    """
+
+    def __init__(
+        self,
+        period_ns: int,
+        options: JobOptions,
+        others: Others,
+        tell: Callable[[Kind, str], None],
+        passed: Callable[[str, Plan | None, float], None],
+        number: int,
+    ) -> None:
+        super().__init__("mediator", period_ns)
+        self.mission = Mission()
+        self.task = "parking"
+        self.verdict: Verdict = "stopped"
+        self.reason = ""
+        self.resumable = False
+        self.number = number
+        self.T_base_board: Array | None = None
+        self.looks: list[Look] = []
+        self.wipe: Wipe | None = None
+        self._options, self._others, self._tell, self._passed = options, others, tell, passed
+        self._fault: Slot[tuple[int, str]] = Slot()
+        self._cause: Cause = ""
+        self._since = self._well = 0
+        self._asked = False
+        self._paths: deque[tuple[int, Path]] = deque()
+        self._law: tuple[int, Law] | None = None
+        self._tries = self._grips = self._again = 0
+        self._choice: Choice | None = None
+        self._hand: Array | None = None
+        self._loose = True  # as far as is known the board stays where it is by itself
+        self._checked = 0
+
+    # -- from outside ----------------------------------------------------------
+
+    def faulted(self, arm: int, text: str) -> None:
+        """Control cannot go on with an arm and holds it."""
+        self._fault.put((arm, text))
+
+    def stop(self, why: str) -> None:
+        """Come to a safe end."""
+        if self.task not in ("safe", "ended", "releasing"):
+            self._halt("other", why)
+        elif self.task == "safe":
+            self._cause, self.reason = "other", why
+
+    # -- its cycles ------------------------------------------------------------
+
+    def step(self, time_ns: int) -> None:
+        """Look after what is going on, and go on when it is done."""
+        self._now = time_ns
+        if self.state != "running":
+            return
+        fault = self._fault.take()
+        if fault is not None and self.task == "wiping":
+            self._halt("torque" if "torque" in fault[1] else "contact", fault[1])
+        getattr(self, f"_{self.task}")()
+
+    def _go(self, event: str) -> None:
+        self.mission.send(event)
+        self.task = str(next(iter(self.mission.configuration_values)))
+        self._asked = False
+        self._paths.clear()
+        self._law = None
+        self._parked = False
+        self._since = self._now
+
+    def _halt(self, cause: Cause, text: str) -> None:
+        """Both arms hold, at once."""
+        control = self._others.control
+        for k in (0, 1):
+            control.orders[k].put(Hold(self._others.arms[k], k))
+        self._cause, self.reason = cause, text
+        self._tell("person" if cause == "other" else "fault", text)
+        if self.task == "wiping":
+            self._passed("halted", None, 0.0)
+        self._go("fail")
+
+    def _finish(self, verdict: Verdict, reason: str, *, resumable: bool = False) -> None:
+        self.verdict, self.reason, self.resumable = verdict, reason, resumable
+        held = self._others.robot.held
+        if held and verdict != "stopped" and self.task in ("looking", "planning"):
+            self._others.robot.grip.put(False)
+            self._go("release")
+        else:
+            self._go("end")
+
+    def _situation(self) -> Situation:
+        felt = self._others.estimation.felt.newest
+        assert felt is not None
+        T = self.T_base_board
+        return Situation(felt.q, self._others.nominal if T is None else T)
+
+    def _route(self, question: ToStrokes | ToGrip | ToPark) -> Route | None:
+        """Ask once; the answer when it is there."""
+        if not self._asked:
+            self._asked = True
+            self._others.navigation.answer.take()
+            self._others.navigation.question.put(question)
+            return None
+        return self._others.navigation.answer.take()
+
+    def _went(self) -> bool:
+        """All paths have been gone along."""
+        report = self._others.control.report.newest
+        if self._law is not None:
+            arm, law = self._law
+            if report is None or report.laws[arm] is not law or not report.effects[arm].done:
+                return False
+            self._law = None
+        if not self._paths:
+            return True
+        arm, path = self._paths.popleft()
+        law = Follow(self._others.arms[arm], arm, path)
+        self._others.control.orders[arm].put(law)
+        self._law = arm, law
+        return False
+
+    # -- what it does ----------------------------------------------------------
+
+    def _parking(self) -> None:
+        if not self._parked:
+            route = self._route(ToPark(self._situation(), 0))
+            if route is None:
+                return
+            if route.reason and not route.paths:
+                self._finish("stopped", route.reason, resumable=True)
+                return
+            self._paths.extend((0, p) for p in route.paths)
+            self._parked = True
+        if not self._went():
+            return
+        if self._cause in ("other", "torque"):
+            self._finish("stopped", self.reason, resumable=True)
+        else:
+            self._go("look")
+            self._tries = 0
+
+    _parked = False
+    _now = 0
+
+    def _looking(self) -> None:
+        look = self._look("after" if self.looks else "before")
+        if look is None:
+            return
+        self.looks.append(look)
+        board, plane = look.sight.board, look.sight.plane
+        if board is None or plane is None or board.confidence < SURE or not board.complete:
+            self._tries += 1
+            if self._tries < LOOKS:
+                self._asked = False
+                return
+            if board is not None and not board.complete:
+                text = "the board is partly out of view"
+            elif self.T_base_board is not None:
+                text = "the board was removed: it is nowhere in view"
+            else:
+                text = "no board is in view"
+            self._finish("stopped", text, resumable=True)
+            return
+        if sum(b.confidence > SURE for b in look.sight.boards) > 1:
+            self._tell("board", "more than one board is in view; the best supported one is wiped")
+        seen = plane.T_base_board
+        assert seen is not None
+        before, self.T_base_board = self.T_base_board, seen
+        away = math.inf if before is None else float(np.linalg.norm(seen[:3, 3] - before[:3, 3]))
+        if before is not None and away > MOVED:
+            self._loose = False
+            self._again += 1
+            self._tell("board", f"the board has moved by {1e3 * away:.0f} mm and is found again")
+            if self._again > LOOKS:
+                self._finish("stopped", "the board moves again and again", resumable=True)
+                return
+        elif self._cause == "contact":
+            text = "the eraser is lost: nothing is felt where the board is seen"
+            self._finish("stopped", text, resumable=True)
+            return
+        self._cause = ""
+        self._plan_or_end(look)
+
+    def _plan_or_end(self, look: Look) -> None:
+        o = self._options
+        self._choice = choose(
+            look.sight.ink_polygons,
+            colours=ink_colours(look.image, look.sight) if o.colour is not None else None,
+            colour=o.colour,
+            within=o.within,
+            without=o.without,
+            objects=look.sight.object_polygons,
+        )
+        if not self._choice.wipe:
+            self._finish("clean", "")
+        elif self.number >= o.passes:
+            left = f"{1e2 * look.sight.covered:.2g} % of the board"
+            self._finish("dirty", f"after {self.number} passes ink is still seen on {left}")
+        elif not self._others.robot.held and (o.hold == "always" or (o.hold == "needed" and not self._loose)):
+            self._go("hold")
+        else:
+            self._go("think")
+
+    def _look(self, why: str) -> Look | None:
+        if not self._asked:
+            self._asked = True
+            self._others.perception.answer.take()
+            self._others.perception.question.put(why)
+            return None
+        look = self._others.perception.answer.take()
+        return look if look is not None and look.why == why else None
+
+    def _holding(self) -> None:
+        if self._law is None and not self._paths and self._hand is None:
+            route = self._route(ToGrip(self._situation()))
+            if route is None:
+                return
+            if route.reason:
+                if self._loose:
+                    self._tell("board", f"{route.reason}; the board stays loose")
+                    self._go("think")
+                else:
+                    self._finish("stopped", route.reason)
+                return
+            self._paths.extend((1, p) for p in route.paths)
+        if not self._went():
+            return
+        robot = self._others.robot
+        if self._hand is None:
+            robot.grip.put(True)
+            self._hand = self._holder_hand()
+            return
+        if robot.held:
+            self._others.control.orders[1].put(Hold(self._others.arms[1], 1))
+            self._tell("board", "the other arm holds the board")
+            self._go("think")
+            return
+        self._hand = None
+        self._grips += 1
+        if self._grips < LOOKS:
+            self._tell("board", "the gripper closed beside the board; look again")
+            self._go("look")
+            self._tries = 0
+        else:
+            self._finish("stopped", "the gripper closes and does not get hold of the board", resumable=True)
+
+    def _holder_hand(self) -> Array:
+        felt = self._others.estimation.felt.newest
+        assert felt is not None
+        arm = self._others.arms[1]
+        T = arm.forward_kinematics(felt.q[1])
+        return T[:3, :3] @ arm.grasp + T[:3, 3]
+
+    def _planning(self) -> None:
+        assert self._choice is not None
+        route = self._route(ToStrokes(self._situation(), self._choice.wipe, self._choice.keep))
+        if route is None:
+            return
+        if route.reason:
+            self._finish("stopped", route.reason)
+            return
+        if route.work is None:
+            text = "what is left is too near to something that is to be left alone"
+            self._finish("dirty", text)
+            return
+        if route.plan is not None and route.plan.left:
+            self._tell("task", f"{len(route.plan.left)} places are out of the eraser's reach")
+        self.number += 1
+        self._route_now = route
+        self._go("move")
+        self._paths.extend((0, p) for p in route.paths)
+
+    _route_now = Route()
+
+    def _moving(self) -> None:
+        if not self._went():
+            return
+        route, o = self._route_now, self._options
+        assert route.work is not None
+        controller = CartesianVelocity(
+            self._others.arms[0],
+            self._others.control.period_ns * 1e-9,
+            CartesianVelocityOptions(**GAINS, max_force=o.max_force, max_torque=o.max_torque),
+        )
+        self.wipe = Wipe(self._others.arms[0], controller, route.work, o.normal_force)
+        self._go("wipe")
+        self._begin_wiping()
+        seen = self.looks[-1].sight.covered
+        self._passed("begun", route.plan, seen)
+        strokes = len(route.plan.strokes) if route.plan is not None else 0
+        self._tell("task", f"pass {self.number}: {strokes} strokes, about {self.wipe.total:.0f} s")
+
+    def _begin_wiping(self) -> None:
+        assert self.wipe is not None
+        self._others.control.orders[0].put(self.wipe)
+        self._checked = self._now
+
+    def _wiping(self) -> None:
+        report = self._others.control.report.newest
+        if report is not None and report.laws[0] is self.wipe and report.effects[0].done:
+            self._passed("done", None, 0.0)
+            self._go("park")
+            return
+        if self._hand is not None:
+            if not self._others.robot.held:
+                self._hand = None
+                self._halt("hand", "the board slipped out of the other arm's hand")
+                return
+            away = float(np.linalg.norm(self._holder_hand() - self._hand))
+            if away > SLIPPED:
+                self._halt("hand", f"the hand that holds the board was pushed away by {1e3 * away:.1f} mm")
+                self._hand = self._holder_hand()
+        elif self._options.look_every > 0.0:
+            self._check()
+
+    def _check(self) -> None:
+        """Is the board still where it was? The arm may hide a part of it."""
+        if not self._asked:
+            if self._now - self._checked < self._options.look_every * 1e9:
+                return
+            self._checked = self._now
+        look = self._look("check")
+        if look is None:
+            return
+        self._asked = False
+        self.checks += 1
+        away = self._others.displacement(look, self._expected())
+        if away is not None and away > MOVED:
+            self._halt("hand", f"the board moved by {1e3 * away:.0f} mm under the eraser")
+            self._loose = False
+
+    checks = 0
+
+    def _expected(self) -> Array:
+        assert self.T_base_board is not None
+        return self.T_base_board
+
+    def _safe(self) -> None:
+        waited = self._now - self._since
+        if self._cause == "torque":
+            felt = self._others.estimation.felt.newest
+            well = felt is not None and felt.believed
+            self._well = (self._well or self._now) if well else 0
+            if self._well and self._now - self._well >= CALM_NS and self.wipe is not None:
+                self._tell("task", "the torque channel is back: it goes on where it was")
+                self.wipe.resume()
+                self._well = 0
+                self._cause = ""
+                self._go("wipe")
+                self._passed("resumed", None, 0.0)
+                self._begin_wiping()
+                return
+            if waited < PATIENCE_NS:
+                return
+        if waited >= CALM_NS:
+            self._go("park")
+
+    def _releasing(self) -> None:
+        if not self._parked:
+            route = self._route(ToPark(self._situation(), 1))
+            if route is None:
+                return
+            self._paths.extend((1, p) for p in route.paths)
+            self._parked = True
+        if self._went():
+            self._go("end")
+
+    def _ended(self) -> None:
+        """Nothing more."""

@@ -1,0 +1,281 @@
+"""The slow activities: perception and navigation. They answer one question at a time."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from .. import vision
+from ..arm import Array
+from .activity import Activity, Slot
+from .fast import Work
+from .motion import Path, find
+from .reach import inverse_kinematics, reachable, tool_poses
+from .result import Look
+from .scene import FRAME, THICK, BoardScene
+from .strokes import Eraser, Motion, Plan, plan
+
+Question = TypeVar("Question")
+Answer = TypeVar("Answer")
+
+ABOVE = 0.06
+"""height to which a tool is taken up before it goes away [m]"""
+MARGIN = 0.008
+"""wiped around what is seen to be dirty: the eye may be off by 4 mm, the tool by as much [m]"""
+BACK = 0.08
+"""way of the gripper's fingers towards the rim [m]"""
+
+
+TURN = 0.6
+"""no joint turns further on such a short way, or the hand would leave it [rad]"""
+
+
+class Slow(Activity, Generic[Question, Answer]):
+    """Answers questions; in a thread of its own where it must not keep the fast ones waiting."""
+
+    def __init__(self, name: str, period_ns: int, threaded: bool) -> None:
+        super().__init__(name, period_ns)
+        self.question: Slot[Question] = Slot()
+        self.answer: Slot[Answer] = Slot()
+        self._pool = ThreadPoolExecutor(1, name) if threaded else None
+        self._coming: Future[Answer] | None = None
+
+    def step(self, time_ns: int) -> None:
+        """Take a question, think, answer."""
+        if self._coming is not None:
+            if not self._coming.done():
+                return
+            self.answer.put(self._coming.result())
+            self._coming = None
+        if self.state != "running":
+            return
+        question = self.question.take()
+        if question is None:
+            return
+        think = self.thinking(time_ns, question)
+        if self._pool is None:
+            self.answer.put(think())
+        else:
+            self._coming = self._pool.submit(think)
+
+    @abstractmethod
+    def thinking(self, time_ns: int, question: Question) -> Callable[[], Answer]:
+        """Begin in the thread of the fast ones; what takes long is what is returned."""
+
+    def clean(self) -> None:
+        """End the thread."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+class Perception(Slow[str, Look]):
+    """Takes a picture and looks for the board and the ink; the question is what the picture is for."""
+
+    def __init__(self, scene: BoardScene, period_ns: int, threaded: bool) -> None:
+        super().__init__("perception", period_ns, threaded)
+        self._scene = scene
+        self._camera = scene.camera
+
+    def thinking(self, time_ns: int, question: str) -> Callable[[], Look]:
+        """The picture now; what is in it later."""
+        image = self._scene.look()
+
+        def see() -> Look:
+            sight = vision.see(image, size=self._scene.ink.size, camera=self._camera)
+            return Look(time_ns, image, sight, question)
+
+        return see
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Situation:
+    """Where everything is, for planning."""
+
+    q: tuple[Array, Array]
+    T_base_board: Array
+    """in the eraser's base, as seen"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToStrokes:
+    """How to wipe what is dirty, and how to get there?"""
+
+    now: Situation
+    wipe: tuple[npt.NDArray[np.float64], ...]
+    keep: tuple[npt.NDArray[np.float64], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToGrip:
+    """How does the other arm take the board?"""
+
+    now: Situation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToPark:
+    """How does an arm get out of the way?"""
+
+    now: Situation
+    arm: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Route:
+    """An answer; with a reason and no path: it cannot be done."""
+
+    paths: tuple[Path, ...] = ()
+    """one after the other"""
+    reason: str = ""
+    plan: Plan | None = None
+    work: Work | None = None
+
+
+class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
+    """Strokes, grasps and ways for both arms."""
+
+    def __init__(
+        self,
+        scene: BoardScene,
+        period_ns: int,
+        threaded: bool,
+        motion: Motion,
+        eraser: Eraser,
+        home: tuple[Array, Array],
+    ) -> None:
+        super().__init__("navigation", period_ns, threaded)
+        self._scene, self._motion, self._eraser, self._home = scene, motion, eraser, home
+
+    def thinking(self, time_ns: int, question: ToStrokes | ToGrip | ToPark) -> Callable[[], Route]:
+        """All of it later."""
+        if isinstance(question, ToStrokes):
+            return lambda: self._strokes(question)
+        if isinstance(question, ToGrip):
+            return lambda: self._grip(question.now)
+        return lambda: self._park(question.now, question.arm)
+
+    def _strokes(self, question: ToStrokes) -> Route:
+        """The better way to lay the eraser first; the other one if the arm does not get everywhere."""
+        refused: Route | None = None
+        turned: bool | None = None
+        for turned in (None, True, False):
+            if refused is not None and refused.plan is not None and refused.plan.turned is turned:
+                continue
+            route = self._laid(question, turned)
+            if not route.reason:
+                return route
+            refused = refused or route
+        assert refused is not None
+        return refused
+
+    def _laid(self, question: ToStrokes, turned: bool | None) -> Route:
+        now, size = question.now, self._scene.ink.size
+        arm = self._scene.arms[0]
+
+        def made(start: Array | None, turned: bool | None) -> Plan:
+            return plan(
+                question.wipe,
+                size,
+                keep=question.keep,
+                eraser=self._eraser,
+                motion=self._motion,
+                start=start,
+                turned=turned,
+                margin=MARGIN,
+            )
+
+        strokes = made(None, turned)
+        if not strokes.strokes:
+            return Route(plan=strokes)
+        # the arm goes to the first stroke through the air, by its joints
+        strokes = made(strokes.strokes[0][0], strokes.turned)
+        reach = reachable(arm, strokes, now.T_base_board)
+        if not reach.ok:
+            return Route(reason=f"the board is out of reach: {reach.reason}", plan=strokes)
+        path = self._way(0, now, reach.q[0])
+        if path is None:
+            return Route(reason="there is no clear way for the arm to the board", plan=strokes)
+        legs = strokes.legs
+        number = itertools.accumulate(leg.phase == "touch" for leg in legs)
+        work = Work(
+            legs,
+            tuple(max(0, k - 1) for k in number),
+            now.T_base_board,
+            strokes.angle + reach.turn,
+            size,
+            self._motion,
+        )
+        return Route((path,), plan=strokes, work=work)
+
+    def _grip(self, now: Situation) -> Route:
+        """By a rim that is not the eraser's side, fingers a little inclined so that the hand stays off the table."""
+        arm, (W, H) = self._scene.arms[1], self._scene.ink.size
+        T = self._scene.T_holder_base @ now.T_base_board
+        out = np.array([0.0, 0.0, 1.0])
+        rims = [((a * W, -FRAME), (0.0, 1.0)) for a in (0.5, 0.3, 0.7)]
+        rims += [((W + FRAME, 0.3 * H), (-1.0, 0.0)), ((-FRAME, 0.3 * H), (1.0, 0.0))]
+        for (at, inward), incline, side in itertools.product(rims, (0.15, 0.0), (1.0, -1.0)):
+            c, s = math.cos(incline), math.sin(incline)
+            d = np.array([*inward, 0.0])
+            z, y = c * d + s * out, side * (c * out - s * d)
+            grasp = np.eye(4)
+            grasp[:3, :3] = np.stack((np.cross(y, z), y, z), axis=1)
+            grasp[:3, 3] = *at, 0.5 * THICK
+            before = grasp.copy()
+            before[:3, 3] -= BACK * z
+            q = inverse_kinematics(arm, T @ before, q=now.q[1])
+            goal = None if q is None else inverse_kinematics(arm, T @ grasp, q=q)
+            if q is None or goal is None or float(np.abs(goal - q).max()) > TURN:
+                continue
+            path = self._way(1, now, q)
+            if path is not None:
+                return Route((path, Path((q, goal), 0.2)))
+        return Route(reason="the other arm cannot take the board: no grasp of its rim is in reach")
+
+    def _park(self, now: Situation, which: int) -> Route:
+        q, home = now.q[which], self._home[which]
+        arm = self._scene.arms[which]
+        T = arm.forward_kinematics(q)
+        T[:3, 3] += T[:3, :3] @ arm.grasp
+        T_board = now.T_base_board if which == 0 else self._scene.T_holder_base @ now.T_base_board
+        start: list[Path] = []
+        if which == 0 and float(T_board[:3, 2] @ (T_board[:3, 3] - T[:3, 3])) < ABOVE:
+            up = T.copy()
+            up[:3, 3] -= ABOVE * T_board[:3, 2]
+            above = inverse_kinematics(arm, up, q=q)
+            if above is not None and float(np.abs(above - q).max()) < TURN:
+                start, q = [Path((q, above), 0.4)], above
+        elif which == 1:
+            back = T.copy()
+            back[:3, 3] -= BACK * T[:3, 2]
+            away = inverse_kinematics(arm, back, q=q)
+            if away is not None and float(np.abs(away - q).max()) < TURN:
+                start, q = [Path((q, away), 0.4)], away
+        path = find(q, home, self._via(which, now, q), self._clearance(which, now))
+        if path is None:
+            return Route(tuple(start), "there is no clear way for an arm to where it rests")
+        return Route((*start, path))
+
+    def _way(self, which: int, now: Situation, goal: Array) -> Path | None:
+        return find(now.q[which], goal, self._via(which, now, goal), self._clearance(which, now))
+
+    def _clearance(self, which: int, now: Situation) -> Callable[[Array], float]:
+        other = now.q[1 - which]
+        return lambda q: self._scene.clearance(which, q, other, now.T_base_board)
+
+    def _via(self, which: int, now: Situation, near: Array) -> list[Array]:
+        """Where it rests, and high above the board in the posture of `near`."""
+        if which == 1:
+            return [self._home[1]]
+        W, H = self._scene.ink.size
+        high = tool_poses(np.array([[0.5 * W, 0.5 * H, 0.2]]), now.T_base_board, 0.0)[0]
+        q = inverse_kinematics(self._scene.arms[0], high, q=near)
+        return [self._home[0], *([] if q is None else [q])]
