@@ -223,24 +223,30 @@ class RouteControl:
     """Controllers along the route, each with the gains of its stretch, and the safety limiter behind them."""
 
     def __init__(self, task: Task, route: Route) -> None:
-        arm = task.scene.arm
-        limits = [j.limits.effort for j in arm.joints]
-        self._limiter = SafetyLimiter(arm)
+        self._task, self._route = task, route
+        self._limiter = SafetyLimiter(task.scene.arm)
         self._stretch = 0.1
-        if task.scene.gains is not None:
-            gains = [task.scene.gains]
-        else:
-            count = int(route.end / self._stretch) + 2
-            poses = [route.sample(i * self._stretch).q for i in range(count)]
-            gains = [gains_at(arm, q, 1.0 / task.rate) for q in poses]
-        self._controllers = [Controller(arm, kp, kd, limit=limits) for kp, kd in gains]
+        fixed = task.scene.gains is not None
+        self._last = 0 if fixed else int(route.end / self._stretch) + 1
+        self._controllers: dict[int, Controller] = {}
+
+    def _controller(self, stretch: int) -> Controller:
+        """Made when the arm gets there: no period of a live arm has to wait for all of them."""
+        known = self._controllers.get(stretch)
+        if known is None:
+            scene = self._task.scene
+            pose = self._route.sample(stretch * self._stretch).q
+            kp, kd = scene.gains or gains_at(scene.arm, pose, 1.0 / self._task.rate)
+            limits = [j.limits.effort for j in scene.arm.joints]
+            known = self._controllers[stretch] = Controller(scene.arm, kp, kd, limit=limits)
+        return known
 
     def step(
         self, time: float, setpoint: Setpoint, state: Touch, load: _CoreLoad, dt: float
     ) -> tuple[Array, Status]:
         """Torque to be sent [N m], and its status."""
-        at = min(int(time / self._stretch), len(self._controllers) - 1)
-        torque, status = self._controllers[at].step(setpoint, state.q, state.dq, load)
+        controller = self._controller(min(int(time / self._stretch), self._last))
+        torque, status = controller.step(setpoint, state.q, state.dq, load)
         torque, limited = self._limiter.step(torque, state.q, state.dq, dt)
         return torque, limited if status == Status.ok else status
 
