@@ -39,8 +39,8 @@ def add(app: typer.Typer) -> None:
     app.command(
         "view",
         help="Show an arm in the browser: what it holds, what pushes it, how sure that is.\n\n"
-        "Without LOG a simulated arm moves where you send it, takes objects and is pushed. With LOG a recording is gone "
-        "through by a slider. With --driver it is a real arm, whose drives are off until you switch them on. "
+        "Without LOG a simulated arm moves where you send it, takes objects and is pushed. With LOG a recording is "
+        "gone through by a slider. With --driver it is a real arm, whose drives are off until you switch them on. "
         "The page stays on this computer unless --listen says otherwise; Ctrl-C ends it.",
         epilog=examples(
             "palpate view",
@@ -128,7 +128,9 @@ def run(
     meshes: Annotated[
         bool, typer.Option("--meshes", help="Draw the description's meshes where their files are found.")
     ] = False,
-    browser: Annotated[bool, typer.Option("--open", help="Open the page in this computer's browser.")] = False,
+    browser: Annotated[
+        bool, typer.Option("--open", help="Open the page in this computer's browser.")
+    ] = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
@@ -259,7 +261,10 @@ def _simulated(
         scene=scene, start=scene.poses[scene.start], poses=(goal,), rate=rate, noise=noise, seed=seed
     )
     source = SimulatedArm(
-        weighing.simulated_driver(task), scene, out=make_folder(out), mass=scene.mass if mass is None else mass
+        weighing.simulated_driver(task),
+        scene,
+        out=make_folder(out),
+        mass=scene.mass if mass is None else mass,
     )
     source.send(name)
     return source

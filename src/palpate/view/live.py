@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .._core import (
+    Conditioner,
     ContactDetector,
     DisturbanceKalman,
     ExtendedKalman,
@@ -30,7 +32,7 @@ from ..control import Setpoint
 from ..drivers.driver import Driver, Pace
 from ..errors import DriverError, InputError, LogError, PalpateError
 from ..logs import Recorder, Sample
-from ..pipeline import Pipeline, Touch
+from ..pipeline import Contact, Payload, Pipeline, Touch
 from ..weigh import (
     Moment,
     Route,
@@ -55,6 +57,8 @@ T = TypeVar("T")
 
 BRAKING_S = 0.4
 """an arm under way comes to rest on its path within this time [s]"""
+_LOAD_S = 0.05
+"""time constant of the acceleration of what is held [s]"""
 _LATE_S = 0.25
 """a simulation that is later than this gives up catching up [s]"""
 _WAITING = 100_000
@@ -64,15 +68,68 @@ _PATIENCE_S = 10.0
 
 
 def view_pipeline(arm: Arm) -> Pipeline:
-    """What weighs by default, with the push at the hand and contacts beside it."""
+    """What weighs by default, with the push at the hand beyond the load."""
     return Pipeline(
         arm,
         observer=DisturbanceKalman(**_observer_options(arm)),
         wrench=WrenchEstimator(),
-        contact=ContactDetector(),
+        conditioner=_conditioner(),
         # the held object's acceleration out of noisy encoders would shake the arrow
         load=HeldLoad(acceleration_time=0.2),
     )
+
+
+def contact_pipeline(arm: Arm, load: HeldLoad) -> Pipeline:
+    """What looks for contacts beside a known load."""
+    return Pipeline(arm, payload=None, contact=ContactDetector(), load=load, conditioner=_conditioner())
+
+
+def _conditioner() -> Conditioner:
+    """Velocities smoothed over 10 ms: differences of encoder counts at 1 kHz are mostly noise."""
+    return Conditioner(time_constant=0.01)
+
+
+class Touched:
+    """Contacts beside what is held: a load counts as held once it has been known for a while.
+
+    To a detector a grasped object is a contact that does not end, and to a payload filter a push is a load. What the
+    filter has called good for `ADOPTED_S` is the load from then on; what pushes for a shorter time is a contact.
+    """
+
+    ADOPTED_S = 1.5
+    """[s]"""
+
+    def __init__(self, arm: Arm, *, mass: float = 0.0) -> None:
+        self._arm, self._mass, self._std = arm, mass, 0.0
+        self._pipeline = contact_pipeline(arm, HeldLoad(mass=mass, acceleration_time=_LOAD_S))
+        self._other_since: float | None = None
+
+    def step(self, time_s: float, sample: Sample, payload: Payload) -> Contact:
+        """The contact after a sample, and what the weighing says of it."""
+        if not self._differs(payload):
+            self._other_since = None
+        elif self._other_since is None:
+            self._other_since = time_s
+        elif time_s - self._other_since > self.ADOPTED_S:
+            self._adopt(payload)
+            self._other_since = None
+        contact = self._pipeline.step(sample).contact
+        assert contact is not None
+        return contact
+
+    def _differs(self, payload: Payload) -> bool:
+        if payload.status != Status.ok:
+            return False
+        error = abs(payload.mass - self._mass)
+        return bool(error > max(4.0 * math.hypot(payload.mass_std, self._std), 0.02 * abs(self._mass)))
+
+    def _adopt(self, payload: Payload) -> None:
+        self._mass, self._std = max(float(payload.mass), 0.0), float(payload.mass_std)
+        com = np.asarray(payload.first_moment) / self._mass if self._mass > 0.0 else np.zeros(3)
+        load = HeldLoad(
+            mass=self._mass, mass_std=self._std, com=tuple(com.tolist()), acceleration_time=_LOAD_S
+        )
+        self._pipeline = contact_pipeline(self._arm, load)
 
 
 def _observer_options(arm: Arm) -> dict[str, float]:
@@ -166,6 +223,7 @@ class LiveArm(Source):
         # a state of its own, that knows of pushes and does not depend on the method that weighs
         self._state = Pipeline(arm, observer=ExtendedKalman(**_observer_options(arm)), payload=None)
         self._load = Load()
+        self._touched = Touched(arm)
         self._motion: Motion | None = None
         self._goal: Array | None = None
         self._recorder: Recorder | None = None
@@ -209,7 +267,7 @@ class LiveArm(Source):
         self._fault, self._last_ns, self._motion = "", None, None
         self._pipeline.reset()
         self._state.reset()
-        self._load = Load()
+        self._load, self._touched = Load(), Touched(self._scene.arm)
 
     def stop(self) -> None:
         """End the loop: the drives off, the recording closed."""
@@ -268,6 +326,8 @@ class LiveArm(Source):
             self._first_ns = sample.time_ns
         since = self._period if self._last_ns is None else (sample.time_ns - self._last_ns) * 1e-9
         self._last_ns = sample.time_ns
+        contact = self._touched.step(1e-9 * sample.time_ns, sample, touch.payload)
+        touch = replace(touch, contact=contact)
         goal, sent, held_back = self._command(sample, touch, state, since)
         truth = self._truth()
         reading = Reading(
@@ -282,9 +342,7 @@ class LiveArm(Source):
         )
         if self._recorder is not None:
             where = goal or Setpoint(touch.q, np.zeros(len(touch.q)), np.zeros(len(touch.q)))
-            moment = Moment(
-                reading.time, sample, touch, where, Status.saturated if held_back else Status.ok
-            )
+            moment = Moment(reading.time, sample, touch, where, Status.saturated if held_back else Status.ok)
             self._write(moment, sent, truth)
         self._waiting.append((reading.time, self._channels.row(reading)))
         self._newest = reading
@@ -594,6 +652,7 @@ class RealArm(LiveArm):
             elif self._driver.state != "enabled":
                 self._driver.enable()
                 self._pipeline.reset()
+                self._touched = Touched(self._scene.arm)
 
         self._do(switch)
 

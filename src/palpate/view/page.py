@@ -35,7 +35,7 @@ from .scene import (
 from .source import Holds, Image, Moves, Plays, Powers, Pushable, Records, Source, Tunes
 
 if TYPE_CHECKING:
-    import viser
+    from viser import CameraHandle, ClientHandle, ViserServer
 
 FPS = 32.0
 """updates of the page per second [Hz]"""
@@ -63,7 +63,10 @@ _STYLE = """<style>
 .pp .line b{color:#1b2430;font-weight:600;font-variant-numeric:tabular-nums}
 .pp .key{white-space:nowrap;margin-right:.7em}
 .pp .key i{display:inline-block;width:.8em;height:.25em;border-radius:.1em;margin-right:.3em;vertical-align:middle}
-@media (max-width:36em){div[style*="width: 20em"]{width:100%!important}div[style*="max-height: 60%"]{max-height:54%!important}}
+@media (max-width:36em){
+div[style*="width: 20em"]{width:100%!important}
+div[style*="max-height: 60%"]{max-height:54%!important}
+}
 .pp .cap{font-size:.8em;font-weight:600;margin:.15em 0 0}
 </style>"""
 
@@ -111,17 +114,25 @@ class Page:
     """
 
     def __init__(
-        self, source: Source, *, host: str = HOST, port: int = PORT, title: str = "palpate", meshes: bool = False
+        self,
+        source: Source,
+        *,
+        host: str = HOST,
+        port: int = PORT,
+        title: str = "palpate",
+        meshes: bool = False,
     ) -> None:
         viser = _viser()
         check_address(host, port)
         with contextlib.redirect_stdout(io.StringIO()):  # it greets with a table of its own
-            self._server: viser.ViserServer = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+            self._server: ViserServer = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         if port not in (0, self._server.get_port()):
             self._server.stop()
-            raise InputError(f"port {port} was taken by another program just now: try again, or take another --listen")
+            raise InputError(
+                f"port {port} was taken by another program just now: try again, or take another --listen"
+            )
         # nobody on the network may publish a robot's page through viser's relay
-        self._server.request_share_url = _no_share  # type: ignore[method-assign]
+        vars(self._server)["request_share_url"] = _no_share
         self._source = source
         self.url = f"http://{'[' + host + ']' if ':' in host else host}:{self._server.get_port()}"
         self.frames = 0
@@ -165,24 +176,34 @@ class Page:
             shadow_opacity=0.2,
         )
         middle = 0.5 * (low + high)
-        away = 0.7 * reach + 0.7 * float(np.linalg.norm(high - low))
+        away = 1.35 * (reach + float(np.linalg.norm(high - low)))
         self._look_at = (float(middle[0]), float(middle[1]), float(middle[2]))
         self._eye = middle + away * np.array([0.72, -0.58, 0.38])
         server.initial_camera.position = (float(self._eye[0]), float(self._eye[1]), float(self._eye[2]))
         server.initial_camera.look_at = self._look_at
+        server.initial_camera.fov = 0.75
         server.initial_camera.near = 0.01 * reach
 
-    def _welcome(self, client: viser.ClientHandle) -> None:
+    def _welcome(self, client: ClientHandle) -> None:
         """On a phone the controls cover the lower half: the arm is seen from farther away, in the upper one."""
-        aspect = client.camera.aspect
-        if not 0.0 < aspect < _PHONE:
-            return
-        middle = np.array(self._look_at)
-        eye = middle + (self._eye - middle) * 1.9
-        half_height = float(np.linalg.norm(eye - middle)) * math.tan(0.5 * client.camera.fov)
-        down = np.array([0.0, 0.0, 0.5 * half_height])
-        client.camera.position = tuple(eye - down)
-        client.camera.look_at = tuple(middle - down)
+        done = False
+
+        def place(camera: CameraHandle) -> None:
+            nonlocal done
+            # the browser takes the first view only after it has said hello
+            if done or not np.allclose(camera.position, self._eye, atol=1e-3):
+                return
+            done = True
+            if not 0.0 < camera.aspect < _PHONE:
+                return
+            middle = np.array(self._look_at)
+            eye = middle + (self._eye - middle) * 1.7
+            half_height = float(np.linalg.norm(eye - middle)) * math.tan(0.5 * camera.fov)
+            down = np.array([0.0, 0.0, 0.56 * half_height])
+            camera.position = eye - down
+            camera.look_at = middle - down
+
+        client.camera.on_update(place)
 
     def _build(self) -> None:
         gui, source = self._server.gui, self._source
@@ -304,9 +325,9 @@ class Page:
             end = gui.add_button("Let go", color="gray")
 
         def push(_: Any) -> None:
-            sign, name = str(axis.value)
+            name = str(axis.value)
             F = np.zeros(3)
-            F[_AXES.index(name)] = float(force.value) * (1.0 if sign == "+" else -1.0)
+            F[_AXES.index(name[1])] = float(force.value) * (1.0 if name[0] == "+" else -1.0)
             source.push(self._arm, str(link.value), F)
 
         def let_go(event: Any) -> None:
@@ -337,7 +358,9 @@ class Page:
 
     def _toggle_recording(self, source: Records) -> None:
         if source.recording is None:
-            self.tell(f"Recording to {source.record()}; the estimate starts anew, so that it replays bit for bit.")
+            self.tell(
+                f"Recording to {source.record()}; the estimate starts anew, so that it replays bit for bit."
+            )
         else:
             self.tell(f"Recorded: {source.end_recording()}")
 
@@ -607,7 +630,7 @@ class _Plots:
 class _ArmNodes:
     """An arm in the 3-D scene, with its arrow, its object and its labels."""
 
-    def __init__(self, server: viser.ViserServer, index: int, shown: ShownArm, meshes: bool) -> None:
+    def __init__(self, server: ViserServer, index: int, shown: ShownArm, meshes: bool) -> None:
         self.shown, self.scale = shown, Scale()
         self._force_view = ForceView()
         self.force: Force | None = None
@@ -646,7 +669,14 @@ class _ArmNodes:
             scale=(2.4 * thick, 2.4 * thick, self._head_length),
         )
         self._cone = self._scene.add_mesh_simple(
-            f"{root}_force/cone", vertices, faces, color=_FORCE_COLOUR, opacity=0.28, side="double", cast_shadow=False, scale=thick
+            f"{root}_force/cone",
+            vertices,
+            faces,
+            color=_FORCE_COLOUR,
+            opacity=0.28,
+            side="double",
+            cast_shadow=False,
+            scale=thick,
         )
         self._force_label = self._scene.add_label(
             f"{root}_force_label", "", visible=False, anchor="bottom-center", font_screen_scale=1.0
@@ -664,7 +694,9 @@ class _ArmNodes:
         )
         self._side = 0.0
         self._label_offset = 0.12 * reach
-        self._label = self._scene.add_label(f"{root}_mass", "–", anchor="bottom-center", font_screen_scale=1.25)
+        self._label = self._scene.add_label(
+            f"{root}_mass", "–", anchor="bottom-center", font_screen_scale=1.25
+        )
 
     def weight(self, reading: Reading) -> Weight:
         """The mass as it is shown."""
@@ -677,8 +709,13 @@ class _ArmNodes:
             frames = link_frames(self.shown.arm, np.nan_to_num(self._q))
             for handle, T in zip(self._frames, frames, strict=True):
                 handle.wxyz, handle.position = _wxyz(T[:3, :3]), T[:3, 3]
-            hand = self.shown.placement @ frames[-1] @ self.shown.arm.T_last_tip @ np.append(self.shown.arm.grasp, 1)
-            self._label.position = hand[:3] + [0.0, 0.0, self._label_offset]
+            hand = (
+                self.shown.placement
+                @ frames[-1]
+                @ self.shown.arm.T_last_tip
+                @ np.append(self.shown.arm.grasp, 1)
+            )
+            self._label.position = hand[:3] + np.array([0.0, 0.0, self._label_offset])
         self._light(lit_links(reading))
         self._show_force(reading)
         weight = self.weight(reading)
@@ -773,7 +810,11 @@ def _mesh(filename: str) -> tuple[Any, Any] | None:
     path = filename.removeprefix("file://")
     try:
         mesh = trimesh.load_mesh(path)
-    except (OSError, ValueError, ImportError):  # not found, or a format that trimesh needs another package for
+    except (
+        OSError,
+        ValueError,
+        ImportError,
+    ):  # not found, or a format that trimesh needs another package for
         return None
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from .._core import ContactDetector, Status, WrenchEstimator
+from .._core import HeldLoad, Status, WrenchEstimator
 from ..arm import Arm, Array
 from ..errors import InputError, PalpateError
 from ..logs import Log
-from ..pipeline import ExternalTorque, Payload, Pipeline, Touch
+from ..pipeline import Contact, ExternalTorque, Payload, Pipeline, Touch
 from ..report._text import TWO_SIDED_95
 from ..weigh import scene, weigh_log
 from .history import thinned
+from .live import contact_pipeline
 from .scene import Badge, Reading, ShownArm
 from .source import Source
 
@@ -44,6 +47,7 @@ class Recording(Source):
         if not len(log):
             raise InputError("the log has no samples: there is nothing to see")
         weighed = weigh_log(log, arm)
+        self._weighed = weighed
         self._model, self._log = weighed.arm, weighed.log
         self._messages = list(weighed.remarks)
         self._arms = (_shown(weighed.arm),)
@@ -58,20 +62,42 @@ class Recording(Source):
         self._from, self._since = 0.0, clock()
 
     def _felt(self, options: Mapping[str, Any]) -> Pipeline:
-        """The pipeline that weighs, with wrench and contacts where they can be had."""
-        for more in (
-            {"wrench": WrenchEstimator().options(), "contact": _detector(self._model)},
-            {"wrench": WrenchEstimator().options()},
-        ):
-            try:
-                return Pipeline.from_options(self._model, {**options, **more})
-            except PalpateError as error:
-                self._messages.append(f"Not everything can be felt in this log: {error}")
-        return Pipeline.from_options(self._model, options)
+        """The pipeline that weighs, with the wrench where it can be had."""
+        load = HeldLoad(acceleration_time=0.2).options()
+        try:
+            return Pipeline.from_options(
+                self._model, {**options, "wrench": WrenchEstimator().options(), "load": load}
+            )
+        except PalpateError as error:
+            self._messages.append(f"No push at the hand can be told from this log: {error}")
+            return Pipeline.from_options(self._model, options)
+
+    def _contacts(self, touch: Touch) -> Contact | None:
+        """Contacts beside what was held: of a whole log it is known afterwards. None: the arm has no masses."""
+        if not self._model.has_dynamics:
+            return None
+        holds = replace(self._weighed, touch=touch).holds
+        edges = [0, *(int(np.searchsorted(self._time, hold.start)) for hold in holds[1:]), len(self._time)]
+        parts = []
+        for hold, (begin, end) in zip(holds, pairwise(edges), strict=True):
+            if begin == end:
+                continue
+            known = hold.status == Status.ok
+            mass, std = (max(hold.mass, 0.0), hold.mass_std) if known else (0.0, 0.0)
+            load = HeldLoad(mass=mass, mass_std=std, acceleration_time=0.05)
+            part = contact_pipeline(self._model, load).run(self._log[begin:end]).contact
+            assert part is not None
+            if not known:  # what is held might be anything: nothing can be told from a push
+                held = np.full(end - begin, int(Status.held), dtype=np.uint8)
+                part = replace(part, active=np.zeros(end - begin, dtype=bool), status=held)
+            parts.append(part)
+        return Contact(
+            **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Contact)}
+        )
 
     def _run(self, pipeline: Pipeline) -> None:
         touch = pipeline.run(self._log)
-        self._pipeline, self._touch = pipeline, touch
+        self._pipeline, self._touch = pipeline, replace(touch, contact=self._contacts(touch))
         n = self._model.n
         rows = np.full((len(self._log), 4 * n + 5), np.nan)
         rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n : 3 * n] = touch.q, touch.dq, self._torque
@@ -79,7 +105,10 @@ class Recording(Source):
         rows[known, 3 * n : 4 * n] = touch.external.torque[known]
         mass, half = touch.payload.mass, TWO_SIDED_95 * touch.payload.mass_std
         rows[:, 4 * n], rows[:, 4 * n + 1], rows[:, 4 * n + 2] = mass, mass - half, mass + half
+        contact = self._touch.contact
         good = touch.payload.status == int(Status.ok)
+        if contact is not None:
+            good &= ~np.asarray(contact.active)
         rows[good, 4 * n + 3] = mass[good]
         if len(self._truth):
             at = np.searchsorted(self._truth_time, self._time, side="right") - 1
@@ -133,7 +162,9 @@ class Recording(Source):
     def state(self) -> Badge:
         """Whether it plays."""
         at = f"{self.position:.1f} of {self.duration:.1f} s"
-        return Badge(f"playing, {at}" if self.playing else f"paused, {at}", "green" if self.playing else "grey")
+        return Badge(
+            f"playing, {at}" if self.playing else f"paused, {at}", "green" if self.playing else "grey"
+        )
 
     def messages(self) -> list[str]:
         """What the weighing had to say."""
@@ -193,10 +224,6 @@ def _shown(arm: Arm) -> ShownArm:
     return ShownArm(arm.name, arm, usual_mass=usual)
 
 
-def _detector(arm: Arm) -> dict[str, Any]:
-    return ContactDetector(source="momentum" if arm.has_dynamics else "model_residual").options()
-
-
 def _at(touch: Touch, row: int) -> Touch:
     """One row of a run."""
     external, payload = touch.external, touch.payload
@@ -221,5 +248,4 @@ def _at(touch: Touch, row: int) -> Touch:
 
 def _picked(part: Any, row: int) -> Any:
     """A wrench or a contact of one row."""
-    names = type(part).__dataclass_fields__
-    return type(part)(**{name: getattr(part, name)[row] for name in names})
+    return type(part)(**{f.name: getattr(part, f.name)[row] for f in fields(part)})

@@ -264,9 +264,7 @@ def drawn_force(shown: ShownArm, reading: Reading, F: Array, C: Array) -> Force:
     half = np.minimum(spread / size, math.tan(_WIDEST)) * length
     value, plus = rounded(size, TWO_SIDED_95 * math.sqrt(max(float(e @ C @ e), 0.0)))
     angle = math.atan2(float(spread[1]), size)
-    sure = (
-        "direction uncertain" if angle > _WIDEST else f"direction ± {max(1, round(math.degrees(angle)))}°"
-    )
+    sure = "direction uncertain" if angle > _WIDEST else f"direction ± {max(1, round(math.degrees(angle)))}°"
     tail = T @ np.append(_grasp(shown.arm, reading.touch.q), 1.0)
     return Force(
         tail=tail[:3],
