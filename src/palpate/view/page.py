@@ -254,7 +254,7 @@ class Page:
             client.add_notification(
                 "Not done" if error else "Note",
                 escape(text),
-                color=LIGHT["red"] if error else LIGHT["blue"],
+                color="red" if error else "blue",
                 auto_close_seconds=12.0 if error else 8.0,
             )
 
@@ -262,7 +262,7 @@ class Page:
         gui = self._server.gui
         with gui.add_folder("Recording"):
             end = max(source.duration, 1e-3)
-            self._slider = gui.add_slider("time [s]", 0.0, end, min(0.01, end), 0.0)
+            self._slider: Any = gui.add_slider("time [s]", 0.0, end, min(0.01, end), 0.0)
             self._dragged = -math.inf
             button = gui.add_button("Pause", color="blue")
             self._play_button = button
@@ -289,7 +289,7 @@ class Page:
         shown = self._arms[0].shown
         with gui.add_folder("Move"):
             poses = gui.add_button_group("pose", list(shown.poses))
-            goal = gui.add_text("angles [rad]", ", ".join("0" for _ in range(shown.arm.n)))
+            goal: Any = gui.add_text("angles [rad]", ", ".join("0" for _ in range(shown.arm.n)))
             go = gui.add_button("Go to these angles", color="blue")
             halt = gui.add_button("Stop here", color="red")
 
@@ -321,7 +321,7 @@ class Page:
         with gui.add_folder("Push (simulated)", expand_by_default=False):
             link = gui.add_dropdown("link", links, initial_value=links[-1])
             axis = gui.add_dropdown("along", [s + a for a in _AXES for s in ("+", "−")], initial_value="+y")
-            force = gui.add_slider("force [N]", 0.0, most, most / 100.0, 0.0)
+            force: Any = gui.add_slider("force [N]", 0.0, most, most / 100.0, 0.0)
             end = gui.add_button("Let go", color="gray")
 
         def push(_: Any) -> None:
@@ -567,8 +567,15 @@ class _Plots:
                     uplot.Series(label="upper", stroke=LIGHT["sky"], width=0.5),
                     uplot.Series(label="lower", stroke=LIGHT["sky"], width=0.5),
                     uplot.Series(label="not to be used", stroke=LIGHT["grey"], width=1.0),
-                    uplot.Series(label="good", stroke=LIGHT["blue"], width=2.0),
-                    uplot.Series(label="true", stroke=LIGHT["ink"], width=1.0, dash=(4.0, 4.0)),
+                    # these may be NaN: kept out of the range, and the good one in dots, which leave gaps where it is
+                    uplot.Series(label="true", stroke=LIGHT["ink"], width=1.0, dash=(4.0, 4.0), auto=False),
+                    uplot.Series(
+                        label="good",
+                        stroke=LIGHT["blue"],
+                        width=0.0,
+                        auto=False,
+                        points=uplot.Series_Points(show=True, size=3.0, fill=LIGHT["blue"], width=0.0),
+                    ),
                 ]
                 bands: Any = (uplot.Band(series=(1, 2), fill="rgba(86,180,233,0.22)"),)
             else:
@@ -617,7 +624,7 @@ class _Plots:
             bottom, top = mass_range(mass, low, high, good, true)
             factor = 1.0 if max(abs(bottom), abs(top)) >= 1.0 else 1e3
             self._caption("kg" if factor == 1.0 else "g")
-            values = factor * np.column_stack((high, low, mass, good, true)).clip(bottom, top)
+            values = factor * np.column_stack((high, low, mass, true, good)).clip(bottom, top)
         columns = len(plot.data) - 1
         plot.data = (time_s, *(np.ascontiguousarray(values[:, k]) for k in range(columns)))
 
