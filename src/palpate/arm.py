@@ -29,6 +29,9 @@ Array: TypeAlias = npt.NDArray[np.float64]
 MAX_JOINTS = 16
 """Longest chain the core holds."""
 
+_LINK_COLOUR = (0.86, 0.87, 0.89, 1.0)
+_JOINT_COLOUR = (0.20, 0.45, 0.72, 1.0)
+
 HUGE = 1e9
 """No length, mass, inertia or torque of an arm comes near; larger ones are errors and overflow later."""
 
@@ -108,6 +111,16 @@ def _same(a: Any, b: Any) -> bool:
     if isinstance(a, tuple):
         return isinstance(b, tuple) and len(a) == len(b) and all(map(_same, a, b))
     return bool(a == b)
+
+
+def smallest_turn(z: Array) -> Array:
+    """(3, 3): the smallest rotation that takes the z axis to a unit vector (3,)."""
+    v, c = np.cross([0.0, 0.0, 1.0], z), float(z[2])
+    if c <= -1.0 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    R: Array = np.eye(3) + K + K @ K / (1.0 + c)
+    return R
 
 
 @dataclass(frozen=True, slots=True)
@@ -543,6 +556,44 @@ class Arm(_Record):
     def has_dynamics(self) -> bool:
         """False if the links have no masses: then only the kinematics work."""
         return self.joints[0].mass > 0.0
+
+    @property
+    def reach(self) -> float:
+        """Length of the chain from the base to the grasp point [m]."""
+        first = self.joints[0].T_parent_joint[:3, 3]
+        return float(sum(np.linalg.norm(end) for end in (first, *self._link_ends())))
+
+    def _link_ends(self) -> list[Array]:
+        """Where each link ends, in its own frame [m]: at the next joint, the last one at the grasp point."""
+        tip = self.T_last_tip
+        return [j.T_parent_joint[:3, 3] for j in self.joints[1:]] + [tip[:3, :3] @ self.grasp + tip[:3, 3]]
+
+    def solid_shapes(self) -> tuple[Shape, ...]:
+        """Primitives to draw every link with: its own, or where it has none (or only meshes) a stand-in.
+
+        A stand-in is a capsule to where the link ends and, of a moving link, a knob about its axis.
+        """
+        shapes = [s for s in self.shapes if s.kind != "mesh" and min(s.size) > 0.0]
+        known = {s.link for s in shapes}
+        radius = max(0.04 * self.reach, 0.005)
+        first = self.joints[0].T_parent_joint[:3, 3]
+        for link, end in [(-1, first), *enumerate(self._link_ends())]:
+            if link in known:
+                continue
+            length = float(np.linalg.norm(end))
+            if length > 1e-3:
+                T = np.eye(4)
+                T[:3, :3], T[:3, 3] = smallest_turn(end / length), 0.5 * end
+                shapes.append(Shape("capsule", (0.8 * radius, length), T, link, _LINK_COLOUR))
+            if link >= 0:
+                T = np.eye(4)
+                T[:3, :3] = smallest_turn(self.joints[link].axis)
+                if self.joints[link].kind == "revolute":
+                    shapes.append(Shape("cylinder", (radius, 2.2 * radius), T, link, _JOINT_COLOUR))
+                else:
+                    sides = (2.0 * radius, 2.2 * radius, 2.0 * radius)
+                    shapes.append(Shape("box", sides, T, link, _JOINT_COLOUR))
+        return tuple(shapes)
 
     def replace(self, **changes: Any) -> Arm:
         """A copy with the given fields changed; the same checks apply (ArmError)."""

@@ -6,7 +6,22 @@ from typing import Annotated, Any
 
 import typer
 
-from . import arm, bench, data, doctor, excite, feel, identify, replay, reproduce, see, simulate, tare, weigh
+from . import (
+    arm,
+    bench,
+    data,
+    doctor,
+    excite,
+    feel,
+    identify,
+    replay,
+    reproduce,
+    see,
+    simulate,
+    tare,
+    view,
+    weigh,
+)
 
 app = typer.Typer(
     name="palpate",
@@ -46,6 +61,7 @@ def _start(
 for module in (
     weigh,
     feel,
+    view,
     simulate,
     replay,
     tare,

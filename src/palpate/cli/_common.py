@@ -55,6 +55,7 @@ def emit(value: dict[str, Any]) -> None:
     """Print one JSON object."""
     json.dump(value, sys.stdout, allow_nan=False, ensure_ascii=False)
     sys.stdout.write("\n")
+    sys.stdout.flush()
 
 
 def console() -> Console:
@@ -102,6 +103,17 @@ def print_rows(rows: list[tuple[str, Text | str]], remarks: Sequence[str] = ()) 
     for remark in remarks:
         table.add_row(Text("!", style="bold yellow", justify="right"), remark)
     out.print(table)
+
+
+def only(where: str, why: str, given: dict[str, Any]) -> None:
+    """Options that have no meaning here must not be given.
+
+    Raises:
+        InputError: one is.
+    """
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"{name} is for {where}, and {why}")
 
 
 def say(text: str = "") -> None:

@@ -27,6 +27,7 @@ from ._common import (
     is_report,
     make_folder,
     mass_text,
+    only,
     open_arm,
     open_log,
     picture_png,
@@ -180,18 +181,18 @@ def run(
 
     if log is not None:
         given = {"--mass": mass, "--pose": pose, "--start": start, "--speed": speed, "--picture": picture}
-        _only("a simulation", "LOG is a recording", given)
-        _only("a real arm", "LOG is a recording", {"--driver": driver})
+        only("a simulation", "LOG is a recording", given)
+        only("a real arm", "LOG is a recording", {"--driver": driver})
     else:
-        _only("a LOG", "nothing is recorded yet", {"--columns": columns})
+        only("a LOG", "nothing is recorded yet", {"--columns": columns})
     if driver is None:
-        _only("a real arm", "there is no --driver", {"--port": port, "--bus": bus, "--rate": rate})
+        only("a real arm", "there is no --driver", {"--port": port, "--bus": bus, "--rate": rate})
         if log is None:
-            _only("a LOG", "nothing is recorded yet", {"--effort": effort})
+            only("a LOG", "nothing is recorded yet", {"--effort": effort})
     else:
         given = {"--mass": mass, "--start": start, "--speed": speed, "--picture": picture}
-        _only("a simulation", "the arm is real", given)
-        _only("a real arm's card", "the driver says what its effort is", {"--effort": effort})
+        only("a simulation", "the arm is real", given)
+        only("a real arm's card", "the driver says what its effort is", {"--effort": effort})
     page = out / "report.html"
     if report:
         make_folder(out)
@@ -291,12 +292,6 @@ def _recording(out: Path) -> Path:
     target = make_folder(out) / "run.mcap"
     check_target(target, is_recording, "the recording")
     return target
-
-
-def _only(where: str, why: str, given: dict[str, Any]) -> None:
-    for name, value in given.items():
-        if value is not None:
-            raise InputError(f"{name} is for {where}, and {why}")
 
 
 def _session(

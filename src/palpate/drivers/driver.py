@@ -286,10 +286,14 @@ class Pace:
         """The clock shows `time_ns` [ns] now."""
         self._wall, self._time_ns = time.monotonic(), time_ns
 
+    def late(self, time_ns: int) -> float:
+        """How long ago the wall's clock passed `time_ns` [ns], [s]; negative: it has not come there yet."""
+        if self._speed is None:
+            return 0.0
+        return time.monotonic() - self._wall - (time_ns - self._time_ns) * 1e-9 / self._speed
+
     def wait(self, time_ns: int) -> None:
         """Return when the wall's clock has come to `time_ns` [ns]; at once if it is late."""
-        if self._speed is None:
-            return
-        rest = self._wall + (time_ns - self._time_ns) * 1e-9 / self._speed - time.monotonic()
+        rest = -self.late(time_ns)
         if rest > 0.0:
             time.sleep(rest)

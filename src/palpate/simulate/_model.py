@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arm import Arm, Array
+from ..arm import Arm, Array, smallest_turn
 from ..errors import ArmError, MissingExtraError, PalpateError
 
 # Dry friction is a constraint in MuJoCo. Its impedance is put at the largest value and its time constant at
@@ -23,8 +23,6 @@ _STICK_SOLREF = (1e-9, 1.0)
 _STICK_SOLIMP = (0.9999, 0.9999, 1e-3, 0.5, 2.0)
 _END_STOP_SOLREF = (0.004, 1.0)
 
-_LINK_COLOUR = (0.86, 0.87, 0.89, 1.0)
-_JOINT_COLOUR = (0.20, 0.45, 0.72, 1.0)
 PAYLOAD_COLOUR = (0.93, 0.49, 0.19, 1.0)
 HIDDEN_COLOUR = (0.93, 0.49, 0.19, 0.0)
 
@@ -88,16 +86,7 @@ def upright(gravity: Array) -> Array:
     size = float(np.linalg.norm(gravity))
     if size == 0.0:
         return np.eye(3)
-    down = gravity / size
-    c = -float(down[2])
-    if c == 1.0:
-        return np.eye(3)
-    if c <= -1.0 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    v = np.cross(down, [0.0, 0.0, -1.0])
-    K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    R: Array = np.eye(3) + K + K @ K / (1.0 + c)
-    return R
+    return smallest_turn(-gravity / size).T
 
 
 def write_inertial(model: Any, body: int, mass: float, com: Array, inertia: Array) -> None:
@@ -248,73 +237,31 @@ def write_arm(model: Any, arm: Arm, parts: Parts) -> None:
     write_inertial(model, parts.payload.id, 0.0, np.zeros(3), np.zeros((3, 3)))
 
 
-def _ends(arm: Arm) -> tuple[list[Array], float]:
-    """Where each link ends, in its own frame: the next joint, or the grasp point; and the arm's reach [m]."""
-    ends = [j.T_parent_joint[:3, 3] for j in arm.joints[1:]] + [
-        arm.T_last_tip[:3, :3] @ arm.grasp + arm.T_last_tip[:3, 3]
-    ]
-    first = arm.joints[0].T_parent_joint[:3, 3]
-    return ends, float(sum(np.linalg.norm(e) for e in [first, *ends]))
-
-
 def _draw_arm(mj: ModuleType, arm: Arm, links: list[Any], collide: dict[str, int]) -> None:
-    """Add geoms for the arm's shapes, and for links that have none."""
+    """Add a geom for every shape of :meth:`palpate.Arm.solid_shapes`."""
     kinds = {
         "box": mj.mjtGeom.mjGEOM_BOX,
         "cylinder": mj.mjtGeom.mjGEOM_CYLINDER,
         "sphere": mj.mjtGeom.mjGEOM_SPHERE,
         "capsule": mj.mjtGeom.mjGEOM_CAPSULE,
     }
-    drawn = set()
-    for shape in arm.shapes:
-        # palpate never opens mesh files, and MuJoCo refuses geoms of size zero
-        if shape.kind == "mesh" or min(shape.size) <= 0.0:
-            continue
-        halves = {"box": 3, "cylinder": 2, "sphere": 1, "capsule": 2}[shape.kind]
-        size = np.zeros(3)
-        size[:halves] = shape.size
-        if shape.kind == "box":
-            size *= 0.5
-        else:
-            size[1:] *= 0.5
+    for shape in arm.solid_shapes():
+        halves = np.zeros(3)
+        halves[: len(shape.size)] = shape.size
+        halves[0 if shape.kind == "box" else 1 :] *= 0.5
         links[shape.link + 1].add_geom(
             type=kinds[shape.kind],
-            size=size,
+            size=halves,
             pos=shape.T[:3, 3],
             quat=quaternion(shape.T[:3, :3]),
             rgba=shape.rgba,
             **collide,
         )
-        drawn.add(shape.link)
-
-    ends, reach = _ends(arm)
-    first = arm.joints[0].T_parent_joint[:3, 3]
-    radius = max(0.04 * reach, 0.005)
-    segments = [(-1, first), *enumerate(ends)]
-    for link, end in segments:
-        if link in drawn:
-            continue
-        if np.linalg.norm(end) > 1e-3:
-            links[link + 1].add_geom(
-                type=mj.mjtGeom.mjGEOM_CAPSULE,
-                fromto=(0.0, 0.0, 0.0, *end),
-                size=(0.8 * radius, 0.0, 0.0),
-                rgba=_LINK_COLOUR,
-                **collide,
-            )
-        if link >= 0:
-            joint = arm.joints[link]
-            z = joint.axis
-            kind = mj.mjtGeom.mjGEOM_CYLINDER if joint.kind == "revolute" else mj.mjtGeom.mjGEOM_BOX
-            knob = links[link + 1].add_geom(type=kind, rgba=_JOINT_COLOUR, **collide)
-            knob.size = (radius, 1.1 * radius, radius)
-            knob.alt.zaxis = z
-            knob.alt.type = mj.mjtOrientation.mjORIENTATION_ZAXIS
 
 
 def _draw(mj: ModuleType, spec: Any, arm: Arm, R_world_base: Array) -> float:
     """Add sky, floor and lights; return the arm's reach [m]."""
-    ends, reach = _ends(arm)
+    reach = arm.reach
     # the floor goes below everything the straight arm touches; an arm that hangs gets room to swing
     T = np.eye(4)
     T[:3, :3] = R_world_base
@@ -322,7 +269,7 @@ def _draw(mj: ModuleType, spec: Any, arm: Arm, R_world_base: Array) -> float:
     for joint in arm.joints:
         T = T @ joint.T_parent_joint
         heights.append(float(T[2, 3]))
-    heights.append(float((T @ np.append(ends[-1], 1.0))[2]))
+    heights.append(float((T @ arm.T_last_tip @ np.append(arm.grasp, 1.0))[2]))
     floor = 0.0 if min(heights) > -1e-6 else -1.15 * reach
 
     spec.add_texture(

@@ -6,7 +6,22 @@ from .hardware import driven_arm, present_pose
 from .proposal import TwoWayMotion, two_way_motion
 from .replay import Difference, Replay, replay
 from .scenes import Scene, find_pose, load_arm, scene, telling_pose, weight_torque
-from .session import Moment, Session, Task, arm_of, arrival, brick, check_mass, run
+from .session import (
+    Moment,
+    Route,
+    RouteControl,
+    Session,
+    Task,
+    arm_of,
+    arrival,
+    brick,
+    check_mass,
+    describe_arm,
+    record_moment,
+    run,
+    simulated_driver,
+    truth_of,
+)
 from .weighing import Hold, Weighing, fit_joints, fit_log, make_pipeline, refused, weigh_log, weigh_session
 
 __all__ = [
@@ -14,6 +29,8 @@ __all__ = [
     "Hold",
     "Moment",
     "Replay",
+    "Route",
+    "RouteControl",
     "Scene",
     "Session",
     "Task",
@@ -23,6 +40,7 @@ __all__ = [
     "arrival",
     "brick",
     "check_mass",
+    "describe_arm",
     "driven_arm",
     "find_pose",
     "fit_joints",
@@ -30,11 +48,14 @@ __all__ = [
     "load_arm",
     "make_pipeline",
     "present_pose",
+    "record_moment",
     "refused",
     "replay",
     "run",
     "scene",
+    "simulated_driver",
     "telling_pose",
+    "truth_of",
     "two_way_motion",
     "weigh_log",
     "weigh_session",

@@ -170,7 +170,8 @@ def brick(mass: float) -> Load | None:
     return Load.box(mass, (size[0], size[1], size[2]))
 
 
-def _driver(task: Task) -> MujocoDriver:
+def simulated_driver(task: Task) -> MujocoDriver:
+    """The simulated arm of a task, closed; objects come and go as the task says."""
     from ..drivers.mujoco import MujocoDriver
     from ..simulate import Attach, Release, Schedule, SensorModel
 
@@ -193,8 +194,8 @@ def _driver(task: Task) -> MujocoDriver:
     return MujocoDriver(arm, sensor=sensor, schedule=Schedule(events), q=task.start, pace=task.speed)
 
 
-class _Route:
-    """Quintic after quintic, with a rest at each pose."""
+class Route:
+    """Setpoints of a task: quintic after quintic, with a rest at each pose."""
 
     def __init__(self, task: Task) -> None:
         speed = np.array([j.limits.velocity for j in task.scene.arm.joints])
@@ -208,6 +209,7 @@ class _Route:
             begin, at = begin + leg.duration + task.hold, pose
 
     def sample(self, time: float) -> Setpoint:
+        """The setpoint at a time [s]."""
         begin, leg = next((x for x in reversed(self._legs) if x[0] <= time), self._legs[0])
         return leg.sample(time - begin)
 
@@ -218,41 +220,47 @@ class _Route:
         return begin + leg.duration
 
 
-class _Control:
+class RouteControl:
     """Controllers along the route, each with the gains of its stretch, and the safety limiter behind them."""
 
-    def __init__(self, task: Task, route: _Route) -> None:
-        arm = task.scene.arm
-        limits = [j.limits.effort for j in arm.joints]
-        self._limiter = SafetyLimiter(arm)
+    def __init__(self, task: Task, route: Route) -> None:
+        self._task, self._route = task, route
+        self._limiter = SafetyLimiter(task.scene.arm)
         self._stretch = 0.1
-        if task.scene.gains is not None:
-            gains = [task.scene.gains]
-        else:
-            count = int(route.end / self._stretch) + 2
-            poses = [route.sample(i * self._stretch).q for i in range(count)]
-            gains = [gains_at(arm, q, 1.0 / task.rate) for q in poses]
-        self._controllers = [Controller(arm, kp, kd, limit=limits) for kp, kd in gains]
+        fixed = task.scene.gains is not None
+        self._last = 0 if fixed else int(route.end / self._stretch) + 1
+        self._controllers: dict[int, Controller] = {}
+
+    def _controller(self, stretch: int) -> Controller:
+        """Made when the arm gets there: no period of a live arm has to wait for all of them."""
+        known = self._controllers.get(stretch)
+        if known is None:
+            scene = self._task.scene
+            pose = self._route.sample(stretch * self._stretch).q
+            kp, kd = scene.gains or gains_at(scene.arm, pose, 1.0 / self._task.rate)
+            limits = [j.limits.effort for j in scene.arm.joints]
+            known = self._controllers[stretch] = Controller(scene.arm, kp, kd, limit=limits)
+        return known
 
     def step(
         self, time: float, setpoint: Setpoint, state: Touch, load: _CoreLoad, dt: float
     ) -> tuple[Array, Status]:
         """Torque to be sent [N m], and its status."""
-        at = min(int(time / self._stretch), len(self._controllers) - 1)
-        torque, status = self._controllers[at].step(setpoint, state.q, state.dq, load)
+        controller = self._controller(min(int(time / self._stretch), self._last))
+        torque, status = controller.step(setpoint, state.q, state.dq, load)
         torque, limited = self._limiter.step(torque, state.q, state.dq, dt)
         return torque, limited if status == Status.ok else status
 
 
 def arrival(task: Task) -> float:
     """When the last pose should be reached [s]."""
-    return _Route(task).end
+    return Route(task).end
 
 
 def describe(task: Task, pipeline: Pipeline) -> dict[str, str]:
     """What a recording must say to be replayed: card, pipeline, task, seed, version."""
     arm = task.scene.arm
-    plan = {
+    plan: dict[str, Any] = {
         "arm": arm.name,
         "start_rad": task.start.tolist(),
         "poses_rad": [q.tolist() for q in task.poses],
@@ -267,12 +275,15 @@ def describe(task: Task, pipeline: Pipeline) -> dict[str, str]:
         "gains": None if task.scene.gains is None else [k.tolist() for k in task.scene.gains],
         "assumed": list(task.scene.assumed),
     }
+    return {**describe_arm(arm, pipeline), "task": json.dumps(plan), "seed": str(task.seed)}
+
+
+def describe_arm(arm: Arm, pipeline: Pipeline) -> dict[str, str]:
+    """What any recording must say for its samples to be understood and replayed: card, pipeline, version."""
     return {
         "palpate_version": __version__,
         "arm_card": card_text(arm),
         "pipeline": json.dumps(pipeline.options()),
-        "task": json.dumps(plan),
-        "seed": str(task.seed),
         "effort_unit": "A" if arm.effort.kind == "current" else "N m",
     }
 
@@ -288,9 +299,18 @@ OUTPUTS = {
 }
 
 
-def _record(
+def record_moment(
     recorder: Recorder, moment: Moment, sent: Array, gain: Array, truth: tuple[Array, Array, float] | None
 ) -> None:
+    """Write a moment with all its outputs, as :func:`replay` reads them.
+
+    Args:
+        recorder: of the arm's joints.
+        moment: what was read, found and wanted.
+        sent: (n,) torque that was really sent [N m].
+        gain: (n,) torque per unit of the driver's effort.
+        truth: of a simulated arm, see :func:`truth_of`; None: nobody knows.
+    """
     time_ns, touch = moment.sample.time_ns, moment.touch
     recorder.sample(*moment.sample)
     external, payload = touch.external, touch.payload
@@ -359,13 +379,13 @@ def run(
         )
     filtered = isinstance(pipeline.payload, PayloadFilter)
     control = pipeline if filtered else Pipeline(arm)
-    route = _Route(task)
-    controller = _Control(task, route)
+    route = Route(task)
+    controller = RouteControl(task, route)
     gain = arm.effort.gain(arm.n)
     plant: Plant | None = None
     periods: Iterable[int] = itertools.count()
     if driver is None:
-        driver = simulated = _driver(task)
+        driver = simulated = simulated_driver(task)
         plant = simulated.plant
         periods = range(round(task.duration * task.rate) + 1)
     elif driver.joint_names != arm.joint_names or driver.effort != arm.effort:
@@ -404,10 +424,10 @@ def run(
                 sent = driver.write(torque)
                 last_ns = sample.time_ns
                 moment = Moment(time, sample, touch, setpoint, status)
-                truth = None if plant is None else _truth(plant)
+                truth = None if plant is None else truth_of(plant)
                 rows.add(moment, sent, truth)
                 if recorder is not None:
-                    _record(recorder, moment, sent, gain, truth)
+                    record_moment(recorder, moment, sent, gain, truth)
                 if progress is not None and time >= next_progress:
                     next_progress += PROGRESS_S
                     progress(moment)
@@ -437,8 +457,8 @@ def _over(task: Task, time: float, touch: Touch) -> bool:
     return late >= 0.0 and (Status(touch.payload.status) != Status.gap or late >= _PATIENCE_S)
 
 
-def _truth(plant: Plant) -> tuple[Array, Array, float]:
-    """Positions [rad], velocities [rad/s] and mass held [kg]."""
+def truth_of(plant: Plant) -> tuple[Array, Array, float]:
+    """A simulated arm's positions [rad], velocities [rad/s] and mass held [kg]."""
     return plant.q, plant.dq, 0.0 if plant.load is None else plant.load.mass
 
 
