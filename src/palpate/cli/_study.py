@@ -28,8 +28,8 @@ Hours = Annotated[
     float | None,
     typer.Option(
         metavar="H",
-        help="Simulate so long instead of the hours asked for (contacts only); what is done is kept in --out, and "
-        "a run with more hours goes on from there.",
+        help="Simulate so long instead of the hours asked for (contacts), of which what is done is kept in --out, so "
+        "that a run with more hours goes on from there; or watch so long (view).",
         show_default=False,
     ),
 ]

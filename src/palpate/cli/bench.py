@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
+from ..errors import InputError
 from ._common import Json, Quiet, examples
 from ._study import Hours, List, Names, Out, Page, Quick
 from ._study import run as run_studies
@@ -21,6 +23,7 @@ def add(app: typer.Typer) -> None:
             "palpate bench --list",
             "palpate bench payload-filter",
             "palpate bench contacts --hours 10",
+            "palpate bench view --minutes 5",
             "palpate bench --quick",
         ),
     )(run)
@@ -32,11 +35,19 @@ def run(
     page: Page = None,
     quick: Quick = False,
     hours: Hours = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="The same in minutes.", show_default=False),
+    ] = None,
     listing: List = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Bench."""
+    if minutes is not None:
+        if hours is not None:
+            raise InputError("--hours and --minutes say the same: give one of them")
+        hours = minutes / 60.0
     return run_studies(
         "bench",
         names,

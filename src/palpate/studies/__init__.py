@@ -131,6 +131,7 @@ _ALL = (
     Study(
         "board-detection", "Whiteboards found in rendered views and photographs, and the ink on them", "bench"
     ),
+    Study("view", "The live page: first picture, updates, memory", "bench", campaign=True),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
 
