@@ -28,8 +28,8 @@ Hours = Annotated[
     float | None,
     typer.Option(
         metavar="H",
-        help="Simulate so long instead of the hours asked for (contacts only); what is done is kept in --out, and "
-        "a run with more hours goes on from there.",
+        help="Simulate so long instead of the hours asked for (contacts), of which what is done is kept in --out, so "
+        "that a run with more hours goes on from there.",
         show_default=False,
     ),
 ]
@@ -37,7 +37,7 @@ Minutes = Annotated[
     float | None,
     typer.Option(
         metavar="MIN",
-        help="Run so long instead of the 10 min asked for (session, fri, rtde, servos only).",
+        help="Run so long by the clock instead of the time asked for (session, fri, rtde, servos, view).",
         show_default=False,
     ),
 ]

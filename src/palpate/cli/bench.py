@@ -22,6 +22,7 @@ def add(app: typer.Typer) -> None:
             "palpate bench payload-filter",
             "palpate bench contacts --hours 10",
             "palpate bench session --minutes 1",
+            "palpate bench view --minutes 5",
             "palpate bench --quick",
         ),
     )(run)

@@ -140,6 +140,7 @@ _ALL = (
         "board-detection", "Whiteboards found in rendered views and photographs, and the ink on them", "bench"
     ),
     Study("session", "The real-time session at 1 kHz while the computer is busy", "bench", timed=True),
+    Study("view", "The live page: first picture, updates, memory", "bench", timed=True),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
 

@@ -35,12 +35,13 @@ from __future__ import annotations
 
 from .history import History
 from .live import LiveArm, Motion, RealArm, SimulatedArm, view_pipeline
-from .page import Page, check_address
+from .page import FPS, Page, check_address
 from .playback import Recording
 from .scene import Badge, Channels, Force, ForceView, Reading, Scale, ShownArm, Weight
 from .source import Holds, Image, Moves, Plays, Powers, Pushable, Records, Source, Tunes
 
 __all__ = [
+    "FPS",
     "Badge",
     "Channels",
     "Force",

@@ -327,13 +327,13 @@ class LiveArm(Source):
         since = self._period if self._last_ns is None else (sample.time_ns - self._last_ns) * 1e-9
         self._last_ns = sample.time_ns
         contact = self._touched.step(1e-9 * sample.time_ns, sample, touch.payload)
-        touch = replace(touch, contact=contact)
+        shown = replace(touch, q=state.q, dq=state.dq, contact=contact)
         goal, sent, held_back = self._command(sample, touch, state, since)
         truth = self._truth()
         reading = Reading(
             time=(sample.time_ns - self._first_ns) * 1e-9,
             sample=sample,
-            touch=touch,
+            touch=shown,
             torque=np.asarray(sample.effort) * self._gain,
             goal=None if goal is None else goal.q,
             held_back=held_back,

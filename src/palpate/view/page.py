@@ -155,6 +155,8 @@ class Page:
             control_width="medium",
             brand_color=(0, 114, 178),
         )
+        # shadows make browsers without a graphics card wait for seconds
+        server.scene.configure_default_lights(enabled=True, cast_shadow=False)
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for nodes in self._arms:
             for q in (np.zeros(nodes.shown.arm.n), *nodes.shown.poses.values()):
