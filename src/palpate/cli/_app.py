@@ -6,7 +6,22 @@ from typing import Annotated, Any
 
 import typer
 
-from . import arm, bench, data, doctor, excite, feel, identify, replay, reproduce, see, simulate, tare, weigh
+from . import (
+    arm,
+    bench,
+    data,
+    doctor,
+    excite,
+    feel,
+    identify,
+    replay,
+    reproduce,
+    ros,
+    see,
+    simulate,
+    tare,
+    weigh,
+)
 
 app = typer.Typer(
     name="palpate",
@@ -53,6 +68,7 @@ for module in (
     excite,
     arm,
     see,
+    ros,
     reproduce,
     bench,
     data,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from .hardware import driven_arm, present_pose
 from .proposal import TwoWayMotion, two_way_motion
 from .replay import Difference, Replay, replay
-from .scenes import Scene, find_pose, load_arm, scene, telling_pose, weight_torque
-from .session import Moment, Session, Task, arm_of, arrival, brick, check_mass, run
+from .scenes import Scene, find_pose, load_arm, parse_effort, scene, telling_pose, weight_torque
+from .session import Moment, Session, Task, arm_of, arrival, brick, check_mass, run, simulated_driver
 from .weighing import Hold, Weighing, fit_joints, fit_log, make_pipeline, refused, weigh_log, weigh_session
 
 __all__ = [
@@ -29,11 +29,13 @@ __all__ = [
     "fit_log",
     "load_arm",
     "make_pipeline",
+    "parse_effort",
     "present_pose",
     "refused",
     "replay",
     "run",
     "scene",
+    "simulated_driver",
     "telling_pose",
     "two_way_motion",
     "weigh_log",

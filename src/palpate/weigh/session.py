@@ -169,7 +169,12 @@ def brick(mass: float) -> Load | None:
     return Load.box(mass, (size[0], size[1], size[2]))
 
 
-def _driver(task: Task) -> MujocoDriver:
+def simulated_driver(task: Task) -> MujocoDriver:
+    """The simulated arm of a task, with its noise, and what it will hold when; closed.
+
+    Raises:
+        MissingExtraError: mujoco is not installed.
+    """
     from ..drivers.mujoco import MujocoDriver
     from ..simulate import Attach, Release, Schedule, SensorModel
 
@@ -372,7 +377,7 @@ def run(
     plant: Plant | None = None
     periods: Iterable[int] = itertools.count()
     if driver is None:
-        driver = simulated = _driver(task)
+        driver = simulated = simulated_driver(task)
         plant = simulated.plant
         periods = range(round(task.duration * task.rate) + 1)
     elif driver.joint_names != arm.joint_names or driver.effort != arm.effort:

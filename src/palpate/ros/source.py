@@ -1,0 +1,227 @@
+"""What a robot publishes as samples of an arm: joints put in order, one publisher, one time base."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from ..arm import Array
+from ..errors import InputError
+from ..logs import Sample
+from .context import STREAM, Reliability
+from .messages import JointState, LBRState
+from .node import Node, Subscription
+
+Kind: TypeAlias = Literal["joint_state", "lbr_state"]
+Stamp: TypeAlias = Literal["header", "arrival"]
+
+KINDS: tuple[Kind, ...] = ("joint_state", "lbr_state")
+STAMPS: tuple[Stamp, ...] = ("header", "arrival")
+_TRIAL = 5
+"""messages of a new publisher that are passed over until it is clear that the one before is silent"""
+_NO_TIME = "its stamps are zero; let them be the time of writing: --stamp arrival, or the parameter stamp"
+_NAMES = 1000
+"""joints in one message, at most"""
+
+
+class SampleSource:
+    """Subscribes to the states of an arm and gives them as samples.
+
+    Joints may come in any order and among others. Where two publish, nothing is used until one of them is gone; one
+    that follows another, such as a driver that was started anew, is taken after a few messages. A stamp that was there
+    already is given out as a repetition; one that lies before the last is passed over, and two of these in order are
+    a new time base.
+
+    Args:
+        node: that reads.
+        joint_names: of the arm, base to tip.
+        topic: where.
+        sample: called with every sample, and whether it repeats the one before.
+        restart: called when a new time base begins: what was known of the past is void.
+        kind: "joint_state" (sensor_msgs/msg/JointState) or "lbr_state" (lbr_fri_idl/msg/LBRState; seven joints, whose
+            torques count as the controller gives them).
+        stamp: "header": the publisher's own time; "arrival": that of the message's writing, for a publisher that
+            leaves its stamps at zero.
+        torque_sign: of "lbr_state": +1 if a positive measured torque pushes the joint in its positive direction, -1 if
+            not. Hold something up and look: the convention was not checked on a robot.
+
+    Raises:
+        InputError: kind or stamp is none of the choices; an LBR has seven joints.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        joint_names: Sequence[str],
+        topic: str,
+        sample: Callable[[Sample, bool], None],
+        *,
+        restart: Callable[[], None] = lambda: None,
+        kind: Kind = "joint_state",
+        stamp: Stamp = "header",
+        torque_sign: int = 1,
+        how: Reliability = STREAM,
+    ) -> None:
+        if kind not in KINDS:
+            raise InputError(f"kind must be {' or '.join(KINDS)}, got {kind!r}")
+        if stamp not in STAMPS:
+            raise InputError(f"stamp must be {' or '.join(STAMPS)}, got {stamp!r}")
+        if kind == "lbr_state" and len(joint_names) != 7:
+            raise InputError(f"an LBR has 7 joints, this arm has {len(joint_names)}")
+        if torque_sign not in (1, -1):
+            raise InputError(f"torque_sign must be 1 or -1, got {torque_sign!r}")
+        self._node = node
+        self._sign = float(torque_sign)
+        self._joints = tuple(joint_names)
+        self._sample, self._restart, self._stamp = sample, restart, stamp
+        self.refused = 0
+        """messages that gave no sample"""
+        self._names: tuple[str, ...] | None = None
+        self._order: list[int] | None = None
+        self._arranged = ""
+        self._writer, self._rival, self._heard = 0, 0, 0
+        self._torn = False
+        self._last = self._back = -(2**63)
+        read = self._joint_state if kind == "joint_state" else self._lbr_state
+        self._read: Callable[[Any], Sample | None] = read
+        message = JointState if kind == "joint_state" else LBRState
+        self.subscription: Subscription = node.subscribe(message, topic, self._take, how)
+        node.watch(self._settle)
+
+    @property
+    def topic(self) -> str:
+        """Full name."""
+        return self.subscription.name
+
+    # --- who publishes -------------------------------------------------------------------------------------------
+
+    def _take(self, message: Any, writer: int) -> None:
+        if writer != self._writer and not self._take_over(writer):
+            self.refused += 1
+            return
+        if self._rival and writer == self._writer and not self._torn:
+            self._torn = True
+            nodes = [p.node or "an unnamed node" for p in self.subscription.publishers()]
+            self._node.trouble(
+                f"{self.topic} publishers",
+                f"{len(nodes)} publish {self.topic} at the same time ({', '.join(sorted(nodes))}): remap or stop one; "
+                "nothing is used meanwhile",
+            )
+        if self._torn:
+            self.refused += 1
+            return
+        sample = self._read(message)
+        if sample is None:
+            self.refused += 1
+            return
+        self._give(sample)
+
+    def _take_over(self, writer: int) -> bool:
+        """Whether a publisher that was not heard before may be followed."""
+        if not self._writer or self._writer not in self.subscription.writers:
+            self._writer, self._rival, self._heard = writer, 0, 0
+            return True
+        if writer != self._rival:
+            self._rival, self._heard = writer, 0
+        self._heard += 1
+        if self._torn or self._heard <= _TRIAL:
+            return False
+        self._writer, self._rival, self._heard = writer, 0, 0
+        return True
+
+    def _settle(self) -> None:
+        """Go on when one of two publishers is gone."""
+        if not self._torn:
+            return
+        writers = self.subscription.writers
+        if self._writer not in writers or self._rival not in writers:
+            self._torn = False
+            self._rival = self._heard = 0
+            self._node.trouble(f"{self.topic} publishers", "")
+
+    # --- when ----------------------------------------------------------------------------------------------------
+
+    def _give(self, sample: Sample) -> None:
+        time_ns, forth = sample.time_ns, -(2**63)
+        if time_ns < self._last:
+            if time_ns <= self._back or self._back == forth:
+                self._back = time_ns
+                self.refused += 1
+                late = (self._last - time_ns) * 1e-9
+                self._node.trouble(
+                    f"{self.topic} time",
+                    f"{self.topic}: a stamp lies {late:.3g} s before the one before",
+                    error=False,
+                )
+                return
+            self._node.log(
+                f"{self.topic}: the publisher's clock went back by {(self._last - time_ns) * 1e-9:.3g} s: "
+                "beginning anew",
+                level=30,
+            )
+            self._restart()
+        if self._back != forth:
+            self._node.trouble(f"{self.topic} time", "")
+            self._back = forth
+        repeated = time_ns == self._last
+        self._last = time_ns
+        self._sample(sample, repeated)
+
+    # --- what ----------------------------------------------------------------------------------------------------
+
+    def _time(self, message: Any, stamped_ns: int) -> int:
+        """[ns], 0: not told."""
+        return int(message.sample_info.source_timestamp) if self._stamp == "arrival" else stamped_ns
+
+    def _complain(self, text: str) -> None:
+        self._node.trouble(f"{self.topic} content", text and f"{self.topic}: {text}"[:500])
+
+    def _joint_state(self, message: JointState) -> Sample | None:
+        names = tuple(message.name)
+        if names != self._names:
+            self._names, self._order = names, None
+            self._arranged = self._arrange(names)
+        complaint, sample = self._arranged, None
+        lengths = len(message.position), len(message.velocity), len(message.effort)
+        time_ns = self._time(message, message.header.stamp.time_ns)
+        if complaint or self._order is None:
+            pass
+        elif time_ns == 0:
+            complaint = _NO_TIME
+        elif lengths[0] != len(names) or any(n not in (0, len(names)) for n in lengths[1:]):
+            complaint = (
+                "{}, {}, {} positions, velocities, efforts".format(*lengths) + f" of {len(names)} joints"
+            )
+        else:
+            velocity = np.array(message.velocity)[self._order] if lengths[1] else None
+            if lengths[2]:
+                effort = np.array(message.effort)[self._order]
+            else:
+                complaint = "no efforts: there is nothing to feel or weigh by"
+                effort = np.full(len(self._joints), np.nan)
+            sample = Sample(time_ns, np.array(message.position)[self._order], velocity, effort)
+        self._complain(complaint)
+        return sample
+
+    def _arrange(self, names: tuple[str, ...]) -> str:
+        """Find the arm's joints among the names; what is wrong with these, or nothing."""
+        said = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "") or "none"
+        if len(names) > _NAMES:
+            return f"{len(names)} joints in one message; at most {_NAMES} are read"
+        if missing := [joint for joint in self._joints if joint not in names]:
+            return f"joint {missing[0]!r} is missing; there are {said}"
+        if len(set(names)) < len(names):
+            return f"a joint comes twice: {said}"
+        self._order = [names.index(joint) for joint in self._joints]
+        return ""
+
+    def _lbr_state(self, message: LBRState) -> Sample | None:
+        time_ns = self._time(message, message.time_stamp_sec * 1_000_000_000 + message.time_stamp_nano_sec)
+        self._complain("" if time_ns else _NO_TIME)
+        if not time_ns:
+            return None
+        position: Array = np.array(message.measured_joint_position, dtype=np.float64)
+        effort: Array = self._sign * np.array(message.measured_torque, dtype=np.float64)
+        return Sample(time_ns, position, None, effort)
