@@ -42,11 +42,11 @@ def add(app: typer.Typer) -> None:
         "run",
         context_settings=_ARGUMENTS,
         help="Run one node until Ctrl-C.\n\n"
-        "Remapping and parameters are given as to any ROS node: --ros-args -r old:=new -p name:=value --params-file FILE. "
-        "NODE is one of arm_simulation, trajectory, control, sliding_mode_observer, extended_kalman_filter, mass.",
+        "Remapping and parameters are given as to any ROS node: "
+        "--ros-args -r old:=new -p name:=value --params-file FILE. NODE is one of arm_simulation, trajectory, control, sliding_mode_observer, extended_kalman_filter, mass.",
         epilog=examples(
             "palpate ros run mass --ros-args -p arm:=robot.arm.yaml -r joint_states:=/arm/joint_states",
-            "palpate ros run mass --ros-args -p arm:=kuka_lbr_iiwa7 -p state_kind:=lbr_state -r joint_states:=/lbr/state",
+            "palpate ros run mass --ros-args -p arm:=lbr.yaml -p state_kind:=lbr_state -r joint_states:=/lbr/state",
             "palpate ros run arm_simulation --ros-args -p payload_mass:=0.4 -r __ns:=/left",
             "palpate ros run control --domain 7 --ros-args --params-file gains.yaml",
         ),

@@ -16,7 +16,7 @@ except ImportError:
 from . import messages
 from .arguments import RosArguments
 from .context import DEFAULT, LATCHED, SENSOR_DATA, STREAM, Context, Endpoint, Reliability
-from .driver import RosDriver
+from .driver import RosDriver, collect
 from .node import Node, Publisher, Subscription
 from .parameters import Parameters
 from .source import SampleSource
@@ -36,5 +36,6 @@ __all__ = [
     "RosDriver",
     "SampleSource",
     "Subscription",
+    "collect",
     "messages",
 ]

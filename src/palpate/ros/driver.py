@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from .._core import __version__
 from ..arm import Arm, Array
 from ..drivers import Driver
 from ..errors import DriverError
-from ..logs import Sample
+from ..logs import Log, Sample
+from ..weigh.session import card_text
 from .arguments import RosArguments
 from .context import STREAM, Context
 from .messages import Float64MultiArray, Header, JointState, Time
@@ -155,7 +157,9 @@ class RosDriver(Driver):
     def _complain_if_silent(self, verb: str) -> None:
         assert self._node is not None and self._source is not None
         silent = time.monotonic() - self._arrived
-        if silent <= self._patience:
+        # what comes and cannot be used will not mend by waiting
+        useless = bool(self._source.refused and self._node.troubles)
+        if silent <= (min(self._patience, 1.0) if useless else self._patience):
             return
         wrong = self._node.troubles or [self._source.subscription.look(), "no message came"]
         reason = next(text for text in wrong if text)
@@ -215,3 +219,37 @@ class RosDriver(Driver):
         if self._context is not None:
             self._context.close()
         self._context = None
+
+
+def collect(
+    arm: Arm,
+    driver: Driver,
+    seconds: float,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+) -> Log:
+    """What a connected driver reads while its own clock advances by `seconds` [s], or until `stop()`.
+
+    The log carries the arm's card, so that it is weighed without naming the arm again.
+
+    Raises:
+        DriverError: the arm is lost.
+    """
+    samples: list[Sample] = []
+    while not stop() and (not samples or samples[-1].time_ns - samples[0].time_ns < seconds * 1e9):
+        sample = driver.read()
+        if sample is not None:
+            samples.append(sample)
+    velocities = [s.velocity for s in samples if s.velocity is not None]
+    return Log(
+        time_ns=np.array([s.time_ns for s in samples], dtype=np.int64),
+        position=np.array([s.position for s in samples]).reshape(-1, arm.n),
+        velocity=np.array(velocities) if samples and len(velocities) == len(samples) else None,
+        effort=np.array([s.effort for s in samples]).reshape(-1, arm.n),
+        joint_names=arm.joint_names,
+        meta={
+            "palpate_version": __version__,
+            "arm_card": card_text(arm),
+            "effort_unit": "A" if arm.effort.kind == "current" else "N m",
+        },
+    )

@@ -79,7 +79,7 @@ class Launch:
 
     def _start(self, name: str) -> None:
         arguments = list(self._arguments)
-        if name == "arm_simulation" and not self._starts[name]:
+        if name == "arm_simulation":
             readers = sum(TASKS[node].reads_samples for node in self.nodes)
             # in front: what the user says of it wins
             arguments = ["--ros-args", "-p", f"arm_simulation:wait_for:={readers}", "--", *arguments]

@@ -83,6 +83,7 @@ class SampleSource:
         self._arranged = ""
         self._writer, self._rival, self._heard = 0, 0, 0
         self._torn = False
+        self._fresh = True
         self._last = self._back = -(2**63)
         read = self._joint_state if kind == "joint_state" else self._lbr_state
         self._read: Callable[[Any], Sample | None] = read
@@ -121,15 +122,19 @@ class SampleSource:
     def _take_over(self, writer: int) -> bool:
         """Whether a publisher that was not heard before may be followed."""
         if not self._writer or self._writer not in self.subscription.writers:
-            self._writer, self._rival, self._heard = writer, 0, 0
+            self._follow(writer)
             return True
         if writer != self._rival:
             self._rival, self._heard = writer, 0
         self._heard += 1
         if self._torn or self._heard <= _TRIAL:
             return False
-        self._writer, self._rival, self._heard = writer, 0, 0
+        self._follow(writer)
         return True
+
+    def _follow(self, writer: int) -> None:
+        self._writer, self._rival, self._heard = writer, 0, 0
+        self._fresh = True
 
     def _settle(self) -> None:
         """Go on when one of two publishers is gone."""
@@ -146,7 +151,8 @@ class SampleSource:
     def _give(self, sample: Sample) -> None:
         time_ns, forth = sample.time_ns, -(2**63)
         if time_ns < self._last:
-            if time_ns <= self._back or self._back == forth:
+            # one stamp from the past is a stray; from a new publisher, or with another behind it, it is a new clock
+            if not self._fresh and (time_ns <= self._back or self._back == forth):
                 self._back = time_ns
                 self.refused += 1
                 late = (self._last - time_ns) * 1e-9
@@ -165,6 +171,7 @@ class SampleSource:
         if self._back != forth:
             self._node.trouble(f"{self.topic} time", "")
             self._back = forth
+        self._fresh = False
         repeated = time_ns == self._last
         self._last = time_ns
         self._sample(sample, repeated)

@@ -1,9 +1,9 @@
 """The published graph, a node for each task: arm, trajectory, control, observers, mass.
 
 Source of the partition: the mass-estimation report (section "A ROS node for each task"; Negrete and Savage 2020).
-Every message carries the stamp of the sample it answers, and nothing looks at a wall clock but the simulated arm, which
-keeps pace and, commanded in step, waits for the command of each sample. A repeated sample is answered by the same message
-again: so a node that comes late, or was started anew, joins without anything being lost or computed twice.
+Every message carries the stamp of the sample it answers, and nothing looks at a wall clock but the simulated arm,
+which keeps pace and, commanded in step, waits for the command of each sample. A repeated sample is answered by the same
+message again: so a node that comes late, or was started anew, joins without anything being lost or computed twice.
 """
 
 from __future__ import annotations
