@@ -43,7 +43,8 @@ def add(app: typer.Typer) -> None:
         context_settings=_ARGUMENTS,
         help="Run one node until Ctrl-C.\n\n"
         "Remapping and parameters are given as to any ROS node: "
-        "--ros-args -r old:=new -p name:=value --params-file FILE. NODE is one of arm_simulation, trajectory, control, sliding_mode_observer, extended_kalman_filter, mass.",
+        "--ros-args -r old:=new -p name:=value --params-file FILE. NODE is one of arm_simulation, trajectory, control, "
+        "sliding_mode_observer, extended_kalman_filter, mass.",
         epilog=examples(
             "palpate ros run mass --ros-args -p arm:=robot.arm.yaml -r joint_states:=/arm/joint_states",
             "palpate ros run mass --ros-args -p arm:=lbr.yaml -p state_kind:=lbr_state -r joint_states:=/lbr/state",

@@ -140,6 +140,8 @@ def _nodes(content: Mapping[Any, Any], prefix: str, path: Path, found: list[Over
 
 def _parameters(values: Mapping[Any, Any], prefix: str, node: str, path: Path, found: list[Override]) -> None:
     for key, value in values.items():
+        if not isinstance(key, str):
+            raise InputError(f"{path}: {node}: a parameter's name must be a text, got {key!r:.60}")
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
             _parameters(value, f"{name}.", node, path, found)

@@ -293,7 +293,7 @@ class Context:
 
 def gid_of(entity: Any) -> Gid:
     """An entity's identity as the graph has it."""
-    return Gid(list(entity.guid.bytes))
+    return Gid(entity.guid.bytes)
 
 
 def new_data(reader: DataReader[Any]) -> ReadCondition:

@@ -486,7 +486,7 @@ class SetParametersAtomicallyReply(
 class Gid(IdlStruct, typename="rmw_dds_common.msg.dds_.Gid_"):
     """``rmw_dds_common/msg/Gid``, 16 bytes as from Iron on."""
 
-    data: Annotated[Sequence[int], idl.array(idl.uint8, 16)] = field(default_factory=lambda: [0] * 16)
+    data: Annotated[Sequence[int], idl.array(idl.uint8, 16)] = bytes(16)
 
 
 Gids: TypeAlias = Annotated[Sequence[Gid], idl.sequence(Gid)]

@@ -64,6 +64,10 @@ class Publisher:
         except Exception as error:  # noqa: BLE001 cyclonedds raises bare ones
             raise InputError(f"{self.name}: {' '.join(str(error).split())[:200]}") from None
 
+    def close(self) -> None:
+        """Publish no more; readers are told at once, whoever still holds this."""
+        self._writer = None
+
     @property
     def readers(self) -> int:
         """How many read it now."""
@@ -111,6 +115,10 @@ class Subscription:
                 handle = message.sample_info.publication_handle & 0xFFFF_FFFF_FFFF_FFFF
                 self._callback(message, handle)
         return count
+
+    def close(self) -> None:
+        """Read no more."""
+        self._condition = self._reader = None
 
     @property
     def writers(self) -> list[int]:
@@ -370,6 +378,10 @@ class Node:
             return
         self.context.remove_node(self._describe)
         self._waitset = None
+        for subscription in self._subscriptions:
+            subscription.close()
+        for publisher in self._publishers:
+            publisher.close()
         self._subscriptions.clear()
         self._publishers.clear()
         self._services.clear()

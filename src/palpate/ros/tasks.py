@@ -145,8 +145,8 @@ class TaskNode(Node):
 class ArmSimulation(TaskNode):
     """The simulated arm: publishes ``joint_states``, takes torque from ``joint_commands`` (a JointState's effort).
 
-    Once a command has come, each period waits for the command that bears its sample's stamp (parameter ``lockstep``);
-    a command without names lets time go on by itself, with no torque.
+    Once a command has come, each period waits for the command that bears its sample's stamp (parameter ``lockstep``;
+    the first may bear any). A command without names lets time go on by itself, with no torque.
     """
 
     task = "arm_simulation"
@@ -216,9 +216,8 @@ class ArmSimulation(TaskNode):
         self.trouble("commands", complaint)
         if complaint:
             return
-        if not self._lockstep:
-            self._commanded, self._command = True, torque
-        elif message.header.stamp.time_ns == self._stamp_ns:
+        joins = not self._commanded  # time went on by itself: no stamp can be the newest
+        if joins or not self._lockstep or message.header.stamp.time_ns == self._stamp_ns:
             self._commanded, self._command = True, torque
         else:
             self._ignored += 1

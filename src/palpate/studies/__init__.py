@@ -131,6 +131,7 @@ _ALL = (
     Study(
         "board-detection", "Whiteboards found in rendered views and photographs, and the ink on them", "bench"
     ),
+    Study("ros2", "ROS 2 beside Fast DDS and ros2-client; the published graph as processes", "bench"),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
 
