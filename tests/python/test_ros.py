@@ -28,12 +28,16 @@ from palpate.ros import Node, RosArguments, RosDriver, SampleSource, messages
 from palpate.ros.arguments import params_file
 from palpate.ros.launch import Launch, graph
 from palpate.ros.messages import (
+    DiagnosticArray,
     Float64,
+    Float64MultiArray,
     GetParametersReply,
     GetParametersRequest,
     Header,
     InertiaStamped,
     JointState,
+    JointTrajectory,
+    JointTrajectoryPoint,
     LBRState,
     ListParametersReply,
     ListParametersRequest,
@@ -583,6 +587,244 @@ class TestDriver(DriverLaws):
         ):
             with pytest.raises(DriverError):
                 RosDriver(arm, **options)  # type: ignore[arg-type]
+
+
+class TestDriverAlone:
+    @pytest.fixture
+    def talk(self) -> Iterator[Any]:
+        """Something that publishes states every few milliseconds, from a thread of its own."""
+        with here() as there, Node("talker", there, quiet=True) as node:
+            out = node.publish(JointState, "/talk")
+            control = {"time_ns": 10**9}
+            end = threading.Event()
+
+            def run() -> None:
+                while not end.wait(0.003):
+                    control["time_ns"] += 4_000_000
+                    out.publish(state(control["time_ns"]))
+
+            thread = threading.Thread(target=run)
+            thread.start()
+            yield there, control
+            end.set()
+            thread.join()
+
+    def _driver(self, **options: Any) -> RosDriver:
+        return RosDriver(
+            ARM.replace(effort=pp.Effort.torque()),
+            "/talk",
+            domain=DOMAIN,
+            localhost=True,
+            patience=60.0,
+            **options,
+        )
+
+    def test_what_a_controller_of_ros2_control_gets(self, talk: Any) -> None:
+        there, _ = talk
+        got: list[list[float]] = []
+        limit = np.array([j.limits.effort for j in ARM.joints])
+        with Node("controller", there, quiet=True) as controller:
+            controller.subscribe(Float64MultiArray, "/commands", lambda m, w: got.append(list(m.data)))
+            with self._driver(command="/commands") as driver:
+                driver.enable()
+                np.testing.assert_array_equal(driver.write(2.0 * limit), limit)
+                driver.disable()
+                driver.disable()
+                until([controller], lambda: len(got) == 2, "two commands")
+        np.testing.assert_array_equal(got, [limit, np.zeros(ARM.n)])
+
+    def test_nobody_takes_commands(self, talk: Any) -> None:
+        with self._driver(command="/commands") as driver:
+            driver._patience = 0.2
+            with pytest.raises(DriverError, match="nobody reads /commands"):
+                driver.enable()
+
+    def test_a_clock_that_goes_back_ends_it_and_connecting_again_goes_on(self, talk: Any) -> None:
+        _, control = talk
+        driver = self._driver()
+        driver.connect()
+        control["time_ns"] = 1000
+        with pytest.raises(DriverError, match="clock of /talk went back"):
+            for _ in range(100_000):
+                driver.read()
+        driver.close()
+        with driver:
+            assert driver.read() is not None and driver.lost == 0
+
+    def test_useless_states_are_told_soon(self, talk: Any) -> None:
+        iiwa = pp.robots.load("kuka_lbr_iiwa7")
+        driver = RosDriver(iiwa, "/talk", domain=DOMAIN, localhost=True, patience=600.0)
+        with pytest.raises(DriverError, match="/talk: joint 'A1' is missing; there are la_1_joint"):
+            driver.connect()
+        assert driver.state == "closed" and driver.troubles == ()
+
+    def test_collect(self, talk: Any) -> None:
+        driver = self._driver()
+        with driver:
+            log = pp.ros.collect(ARM, driver, 0.2)  # type: ignore[attr-defined]
+        assert log.duration >= 0.2 and log.joint_names == ARM.joint_names
+        assert pp.weigh.arm_of(log).name == ARM.name
+
+
+class TestTasks:
+    """One node at a time."""
+
+    @pytest.fixture
+    def me(self) -> Iterator[Node]:
+        with here() as there, Node("tester", there, quiet=True) as node:
+            yield node
+
+    def test_trajectory(self, me: Node) -> None:
+        rest = np.zeros(ARM.n)
+        with TASKS["trajectory"](me.context, arguments("-p", "move:=1.0"), quiet=True) as node:
+            got: list[Any] = []
+            states, goals = me.publish(JointState, "joint_states"), me.publish(JointState, "goal")
+            me.subscribe(JointTrajectory, "setpoint", lambda m, w: got.append(m))
+            until([me, node], lambda: states.readers and goals.readers and node._out.readers, "a match")
+
+            def ask(seconds: float) -> Any:
+                count = len(got) + 1
+                states.publish(state(10**9 + round(seconds * 1e9), position=rest.tolist()))
+                until([me, node], lambda: len(got) == count, "a setpoint")
+                return got[-1].points[0]
+
+            assert ask(0.0).positions == rest.tolist()
+            middle = ask(0.5)
+            assert ask(0.5) == middle and got[-1] == got[-2], "the same sample, the same answer"
+            goal = node.scene.poses["Take3"]
+            end = ask(100.0)
+            np.testing.assert_allclose(end.positions, goal)
+            np.testing.assert_array_equal([end.velocities, end.accelerations], 0.0)
+            for names, position in ((["x"], [0.0]), (["la_1_joint"], []), (["la_1_joint"], [99.0])):
+                goals.publish(JointState(name=names, position=position))
+                until([me, node], lambda: node.troubles, "a refusal")
+                goals.publish(JointState(name=["la_1_joint"], position=[0.3]))
+                until([me, node], lambda: not node.troubles, "its end")
+            np.testing.assert_allclose(ask(101.0).positions, goal)
+            np.testing.assert_allclose(ask(200.0).positions, [0.3, *goal[1:]])
+            node.parameters.set({"pose": "StandBy"})
+            with pytest.raises(InputError, match="StandBy"):
+                node.parameters.set({"pose": "StandBi"})
+            ask(201.0)
+            np.testing.assert_allclose(ask(300.0).positions, node.scene.poses["StandBy"])
+
+    def test_control(self, me: Node) -> None:
+        with TASKS["control"](me.context, quiet=True) as node:
+            got: list[Any] = []
+            states, setpoints = (
+                me.publish(JointState, "estimated_state"),
+                me.publish(JointTrajectory, "setpoint"),
+            )
+            me.subscribe(JointState, "joint_commands", lambda m, w: got.append(m))
+            until([me, node], lambda: states.readers and setpoints.readers and node._out.readers, "a match")
+            q = node.scene.poses["Take3"]
+            names = ARM.joint_names
+            zero = [0.0] * ARM.n
+            point = JointTrajectoryPoint(q.tolist(), zero, zero)
+
+            def at(time_ns: int) -> Header:
+                return Header(Time.of(time_ns))
+
+            setpoints.publish(JointTrajectory(at(10), names, [point]))
+            states.publish(JointState(at(10), names[::-1], q[::-1].tolist(), zero))
+            until([me, node], lambda: got, "a command")
+            np.testing.assert_allclose(got[0].effort, node.arm.gravity_torque(q), atol=1e-6)
+            assert got[0].header.stamp == Time.of(10) and tuple(got[0].name) == names
+            states.publish(JointState(at(10), names, q.tolist(), zero))
+            until([me, node], lambda: len(got) == 2, "the same again")
+            assert got[1] == got[0]
+            states.publish(JointState(at(20), names[:-1], q[:-1].tolist(), zero[:-1]))
+            setpoints.publish(JointTrajectory(at(20), names, []))
+            until([me, node], lambda: len(node.troubles) == 2, "refusals")
+            states.publish(JointState(at(30), names, q.tolist(), zero))
+            setpoints.publish(JointTrajectory(at(30), names, [point]))
+            until([me, node], lambda: len(got) == 3, "a command")
+            assert not node.troubles
+            with pytest.raises(InputError, match="kp"):
+                node.parameters.set({"kp": [1.0, 2.0]})
+
+    def test_arm(self, me: Node) -> None:
+        """Commands that are none, an object put into its hand, and commands that stay away."""
+        options = [
+            "-p",
+            "lockstep:=false",
+            "-p",
+            "pace:=0.0",
+            "-p",
+            "payload_mass:=0.0",
+            "-p",
+            "noise:=false",
+        ]
+        with ArmSimulation(me.context, arguments(*options), quiet=True) as arm:
+            commands = me.publish(JointState, "joint_commands")
+            until([me, arm], lambda: commands.readers, "a match")
+            arm.work()
+            names = ARM.joint_names
+            for names_, effort, words in (
+                (names[1:], [0.0] * 6, "one effort for each"),
+                (names, [0.0] * 6, "one effort for each"),
+                (names, [math.nan] * 7, "not a finite number"),
+            ):
+                commands.publish(JointState(name=names_, effort=effort))
+                until([me], lambda: arm.spin_once(0.0) or arm.troubles, "the complaint")
+                assert words in arm.troubles[0]
+            commands.publish(JointState(name=names, effort=[0.5] * 7))
+            until([me], lambda: arm.spin_once(0.0) or arm._command is not None, "the command")
+            assert not arm.troubles
+            arm.work()
+            held = 0
+            while arm._commanded:
+                arm.work()
+                held += 1
+                assert held < 40
+            assert 25 <= held <= 26, "0.1 s at 250 Hz, then no torque"
+            with Node("second", me.context, quiet=True) as second:
+                other = second.publish(JointState, "joint_commands")
+                until([me, second], lambda: other.readers, "a match")
+                commands.publish(JointState(name=names, effort=[0.5] * 7))
+                until([me, second], lambda: arm.spin_once(0.0) or arm.troubles, "the complaint")
+                assert "two nodes command this arm" in arm.troubles[0]
+            arm.parameters.set({"payload_mass": 0.4})
+            assert arm._driver.plant.load is not None and arm._driver.plant.load.mass == 0.4
+            arm.parameters.set({"payload_mass": 0.0})
+            assert arm._driver.plant.load is None
+            with pytest.raises(InputError, match="mass"):
+                arm.parameters.set({"payload_mass": -1.0})
+
+    def test_an_estimator_begins_anew_where_an_option_changes(self, me: Node) -> None:
+        with TASKS["sliding_mode_observer"](me.context, quiet=True) as node:
+            before = node._pipeline
+            node.parameters.set({"use_sim_time": True})
+            assert node._pipeline is before
+            node.parameters.set({"observer.alpha": 5.0})
+            assert node._pipeline is not before and node._pipeline.observer.alpha == 5.0
+            with pytest.raises(InputError, match="alpha"):
+                node.parameters.set({"observer.alpha": -5.0})
+
+    def test_diagnostics_tell_the_status(self, me: Node) -> None:
+        with TASKS["mass"](me.context, quiet=True) as node:
+            told: list[DiagnosticArray] = []
+            numbers: list[float] = []
+            me.subscribe(DiagnosticArray, "/diagnostics", lambda m, w: told.append(m))
+            me.subscribe(Float64, "payload_mass", lambda m, w: numbers.append(m.data))
+            states = me.publish(JointState, "joint_states")
+            until([me, node], lambda: states.readers and node._mass.readers, "a match")
+            states.publish(state(10, effort=[math.nan] * ARM.n))
+            until([me, node], lambda: numbers, "an answer")
+            assert math.isnan(numbers[0])
+
+            def status() -> list[str]:
+                return [
+                    pair.value
+                    for array in told
+                    for one in array.status
+                    if one.name == "mass"
+                    for pair in one.values
+                    if pair.key == "status"
+                ]
+
+            until([me, node], status, "its status")
+            assert status()[-1] not in ("", "ok")
 
 
 LAUNCHED = ["-p", "arm_simulation:pace:=0.0", "-p", "arm_simulation:seed:=3"]
