@@ -14,7 +14,7 @@ from palpate.ros.launch import Launch, graph
 from palpate.ros.messages import Float64, JointState
 
 domain = 1 + os.getpid() % 100  # so that this example meets no other; on a robot: nothing, or ROS_DOMAIN_ID
-simulation = {"pace": 0.0, "duration": 3.0, "seed": 1, "wait_for": 5}  # as fast as it goes; four nodes and this one read
+simulation = {"pace": 0.0, "duration": 3.0, "seed": 1, "wait_for": 5}  # at full pace; five read
 arguments = ["--ros-args"]
 for name, value in simulation.items():
     arguments += ["-p", f"arm_simulation:{name}:={value}"]

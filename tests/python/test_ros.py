@@ -778,12 +778,18 @@ class TestTasks:
                 held += 1
                 assert held < 40
             assert 25 <= held <= 26, "0.1 s at 250 Hz, then no torque"
+            commands.publish(JointState(name=names, effort=[0.5] * 7))
+            until([me], lambda: arm.spin_once(0.0) or arm._command is not None, "the command")
             with Node("second", me.context, quiet=True) as second:
                 other = second.publish(JointState, "joint_commands")
-                until([me, second], lambda: other.readers, "a match")
+                until([me, second], lambda: other.readers and len(arm._reader.writers) == 2, "a match")
+                other.publish(JointState(name=names, effort=[9.0] * 7))
+                until([me, second], lambda: arm.spin_once(0.0), "the intruder's command")
+                assert arm._command is not None and arm._command[0] == 0.5
                 commands.publish(JointState(name=names, effort=[0.5] * 7))
                 until([me, second], lambda: arm.spin_once(0.0) or arm.troubles, "the complaint")
-                assert "two nodes command this arm" in arm.troubles[0]
+                assert "2 publish /joint_commands at the same time (/second, /tester)" in arm.troubles[0]
+            until([me], lambda: arm.spin_once(0.0) or not arm.troubles, "recovery")
             arm.parameters.set({"payload_mass": 0.4})
             assert arm._driver.plant.load is not None and arm._driver.plant.load.mass == 0.4
             arm.parameters.set({"payload_mass": 0.0})
@@ -948,6 +954,22 @@ class TestProcesses:
 
 
 class TestCommands:
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+    def test_a_launch_leaves_nothing_behind(self, number: int) -> None:
+        """Whether it is asked to end or killed."""
+        without = [f"--without={name}" for name in TASKS if name not in ("mass", "trajectory")]
+        launched = palpate_ros("launch", "mass-estimation", *without)
+        try:
+            with here() as there, Node("watcher", there, quiet=True) as me:
+                until([me], lambda: len(there.nodes()) == 3, "the nodes")
+                launched.send_signal(number)
+                until([me], lambda: there.nodes() == ["/watcher"], "their leaving")
+            output = launched.communicate(timeout=60)[0]
+        finally:
+            launched.kill()
+        assert launched.returncode == (130 if number == signal.SIGINT else -9)
+        assert "Traceback" not in output and "[/mass] what is held" in output
+
     @pytest.mark.parametrize(
         ("line", "words"),
         [

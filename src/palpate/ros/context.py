@@ -26,8 +26,6 @@ from .names import plain_type
 
 LARGEST = 256
 """messages larger than this are dropped before they are put together [kB]"""
-_LEASE = 3
-"""a process that says nothing for so long is gone [s]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +113,7 @@ def _local() -> bool:
 
 def _configuration(localhost: bool) -> str:
     """For Cyclone DDS; ``CYCLONEDDS_URI`` comes behind and wins."""
-    own = (
-        f"<Discovery><LeaseDuration>{_LEASE} s</LeaseDuration></Discovery>"
-        f"<Internal><MaxSampleSize>{LARGEST} kB</MaxSampleSize></Internal>"
-    )
+    own = f"<Internal><MaxSampleSize>{LARGEST} kB</MaxSampleSize></Internal>"
     if localhost:
         own += (
             '<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'

@@ -26,6 +26,57 @@ _NAMES = 1000
 """joints in one message, at most"""
 
 
+class OneWriter:
+    """Follows one writer of a topic. Where two write, nothing is taken until one of them is gone.
+
+    One that follows another, such as a node that was killed and started anew, is taken after a few messages: the
+    other one may be long dead before that is known.
+    """
+
+    def __init__(self, node: Node, subscription: Subscription) -> None:
+        self.fresh = True
+        """another writer is followed than before; whoever has seen that puts it to False"""
+        self._node, self._subscription = node, subscription
+        self._writer, self._rival, self._heard = 0, 0, 0
+        self._torn = False
+        node.watch(self._settle)
+
+    def accept(self, writer: int) -> bool:
+        """Whether a message of this writer may be used."""
+        if writer != self._writer and not self._take_over(writer):
+            return False
+        if self._rival and not self._torn:
+            self._torn = True
+            topic = self._subscription.name
+            nodes = sorted(p.node or "an unnamed node" for p in self._subscription.publishers())
+            self._node.trouble(
+                f"{topic} publishers",
+                f"{len(nodes)} publish {topic} at the same time ({', '.join(nodes)}): remap or stop one; "
+                "nothing is used meanwhile",
+            )
+        return not self._torn
+
+    def _take_over(self, writer: int) -> bool:
+        """Whether a writer that was not followed before may be."""
+        known = bool(self._writer) and self._writer in self._subscription.writers
+        if known and writer != self._rival:
+            self._rival, self._heard = writer, 0
+        self._heard += 1
+        if known and (self._torn or self._heard <= _TRIAL):
+            return False
+        self._writer, self._rival, self._heard = writer, 0, 0
+        self.fresh = True
+        return True
+
+    def _settle(self) -> None:
+        """Go on when one of two writers is gone."""
+        writers = self._subscription.writers if self._torn else []
+        if self._torn and not {self._writer, self._rival} <= set(writers):
+            self._torn = False
+            self._rival = self._heard = 0
+            self._node.trouble(f"{self._subscription.name} publishers", "")
+
+
 class SampleSource:
     """Subscribes to the states of an arm and gives them as samples.
 
@@ -81,70 +132,24 @@ class SampleSource:
         self._names: tuple[str, ...] | None = None
         self._order: list[int] | None = None
         self._arranged = ""
-        self._writer, self._rival, self._heard = 0, 0, 0
-        self._torn = False
-        self._fresh = True
         self._last = self._back = -(2**63)
         read = self._joint_state if kind == "joint_state" else self._lbr_state
         self._read: Callable[[Any], Sample | None] = read
         message = JointState if kind == "joint_state" else LBRState
         self.subscription: Subscription = node.subscribe(message, topic, self._take, how)
-        node.watch(self._settle)
+        self._one = OneWriter(node, self.subscription)
 
     @property
     def topic(self) -> str:
         """Full name."""
         return self.subscription.name
 
-    # --- who publishes -------------------------------------------------------------------------------------------
-
     def _take(self, message: Any, writer: int) -> None:
-        if writer != self._writer and not self._take_over(writer):
-            self.refused += 1
-            return
-        if self._rival and writer == self._writer and not self._torn:
-            self._torn = True
-            nodes = [p.node or "an unnamed node" for p in self.subscription.publishers()]
-            self._node.trouble(
-                f"{self.topic} publishers",
-                f"{len(nodes)} publish {self.topic} at the same time ({', '.join(sorted(nodes))}): remap or stop one; "
-                "nothing is used meanwhile",
-            )
-        if self._torn:
-            self.refused += 1
-            return
-        sample = self._read(message)
+        sample = self._read(message) if self._one.accept(writer) else None
         if sample is None:
             self.refused += 1
-            return
-        self._give(sample)
-
-    def _take_over(self, writer: int) -> bool:
-        """Whether a publisher that was not heard before may be followed."""
-        if not self._writer or self._writer not in self.subscription.writers:
-            self._follow(writer)
-            return True
-        if writer != self._rival:
-            self._rival, self._heard = writer, 0
-        self._heard += 1
-        if self._torn or self._heard <= _TRIAL:
-            return False
-        self._follow(writer)
-        return True
-
-    def _follow(self, writer: int) -> None:
-        self._writer, self._rival, self._heard = writer, 0, 0
-        self._fresh = True
-
-    def _settle(self) -> None:
-        """Go on when one of two publishers is gone."""
-        if not self._torn:
-            return
-        writers = self.subscription.writers
-        if self._writer not in writers or self._rival not in writers:
-            self._torn = False
-            self._rival = self._heard = 0
-            self._node.trouble(f"{self.topic} publishers", "")
+        else:
+            self._give(sample)
 
     # --- when ----------------------------------------------------------------------------------------------------
 
@@ -152,7 +157,7 @@ class SampleSource:
         time_ns, forth = sample.time_ns, -(2**63)
         if time_ns < self._last:
             # one stamp from the past is a stray; from a new publisher, or with another behind it, it is a new clock
-            if not self._fresh and (time_ns <= self._back or self._back == forth):
+            if not self._one.fresh and (time_ns <= self._back or self._back == forth):
                 self._back = time_ns
                 self.refused += 1
                 late = (self._last - time_ns) * 1e-9
@@ -171,7 +176,7 @@ class SampleSource:
         if self._back != forth:
             self._node.trouble(f"{self.topic} time", "")
             self._back = forth
-        self._fresh = False
+        self._one.fresh = False
         repeated = time_ns == self._last
         self._last = time_ns
         self._sample(sample, repeated)

@@ -40,7 +40,7 @@ from .messages import (
     WrenchStamped,
 )
 from .node import Node, Publisher
-from .source import KINDS, STAMPS, SampleSource
+from .source import KINDS, STAMPS, OneWriter, SampleSource
 
 _Message = TypeVar("_Message")
 _RESEND = 0.25
@@ -179,6 +179,7 @@ class ArmSimulation(TaskNode):
         self._gain = self.arm.effort.gain(self.arm.n)
         self._states = self.publish(JointState, "joint_states")
         self._reader = self.subscribe(JointState, "joint_commands", self._take)
+        self._one = OneWriter(self, self._reader)
         self._message = JointState()
         self._stamp_ns, self._sent = 0, 0.0
         self._commanded = self._awaited > 0
@@ -198,6 +199,8 @@ class ArmSimulation(TaskNode):
                 self._driver.plant.attach(load)
 
     def _take(self, message: JointState, writer: int) -> None:
+        if not self._one.accept(writer):
+            return
         if not message.name:
             self._commanded, self._command = False, np.zeros(self.arm.n)
             return
@@ -211,8 +214,6 @@ class ArmSimulation(TaskNode):
             torque = np.array([effort[name] for name in self.arm.joint_names])
             if not np.isfinite(torque).all():
                 complaint = f"{self._reader.name}: an effort is not a finite number"
-        if len(self._reader.writers) > 1:
-            complaint = f"{self._reader.name}: two nodes command this arm: stop or remap one"
         self.trouble("commands", complaint)
         if complaint:
             return
@@ -377,8 +378,8 @@ class Control(TaskNode):
         self._newest: int | None = None
         self._message: JointState | None = None
         self._out = self.publish(JointState, "joint_commands")
-        self.subscribe(JointState, "estimated_state", self._state)
-        self.subscribe(JointTrajectory, "setpoint", self._setpoint)
+        self._one_state = OneWriter(self, self.subscribe(JointState, "estimated_state", self._state))
+        self._one_setpoint = OneWriter(self, self.subscribe(JointTrajectory, "setpoint", self._setpoint))
 
     def _consider(self, values: Mapping[str, Any]) -> None:
         limit = [j.limits.effort for j in self.arm.joints]
@@ -401,11 +402,15 @@ class Control(TaskNode):
         return [np.array(row, dtype=np.float64)[order] for row in rows]
 
     def _state(self, message: JointState, writer: int) -> None:
+        if not self._one_state.accept(writer):
+            return
         found = self._vectors("estimated_state", message.name, message.position, message.velocity)
         if found is not None:
             self._keep(self._states, message.header.stamp.time_ns, (found[0], found[1]))
 
     def _setpoint(self, message: JointTrajectory, writer: int) -> None:
+        if not self._one_setpoint.accept(writer):
+            return
         if len(message.points) != 1:
             self.trouble("setpoint", f"setpoint: expected one point, got {len(message.points)}")
             return

@@ -384,6 +384,6 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
         "Each JointState goes to the peer and back by reliable topics of depth 1000, so what is not lost there and "
         "back was lost neither way. The sender is Python; times include what else the machine did.",
         "The graph is launched by palpate ros launch mass-estimation in step with its simulated arm. A killed node is "
-        "ended by SIGKILL and started anew by the launcher; a dead process is known to be dead after 3 s.",
+        "ended by SIGKILL and started anew by the launcher.",
     ]
     return rows, {}, notes
