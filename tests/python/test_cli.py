@@ -34,6 +34,7 @@ VERBS = (
     "arm",
     "data",
     "see",
+    "ros",
 )
 
 
@@ -537,13 +538,17 @@ def test_the_real_studies_are_known(palpate) -> None:
 
 
 @pytest.mark.parametrize(
-    "verb", ["", *VERBS, "arm show", "arm export", "arm list", "data get", "data list", "data path"]
+    "verb",
+    [
+        *("", *VERBS, "arm show", "arm export", "arm list", "data get", "data list", "data path"),
+        *("ros run", "ros launch", "ros list", "ros echo"),
+    ],
 )
 def test_every_verb_has_help_with_examples(verb: str, palpate) -> None:
     done = palpate(*verb.split(), "--help")
     assert done.code == 0 and done.err == ""
     assert done.out.startswith(f"Usage: palpate {verb}".rstrip())
-    if verb not in ("", "arm", "data"):
+    if verb not in ("", "arm", "data", "ros"):
         assert "Examples:\n    palpate " in done.out or "Examples:\n    ls $(palpate" in done.out
     assert "[dim]" not in done.out and "[bold]" not in done.out
 

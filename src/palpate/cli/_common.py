@@ -229,25 +229,10 @@ def open_arm(
         InputError: neither torque nor current with gains.
         ArmError: no such arm; a gain is zero, or their number is wrong.
     """
-    from ..arm import Effort
-    from ..weigh import load_arm
+    from ..weigh import load_arm, parse_effort
 
     arm = load_arm(source, base=base, tip=tip, repair_inertia=repair)
-    if effort is None:
-        return arm
-    if effort == "torque":
-        return arm.replace(effort=Effort.torque())
-    kind, _, gains = effort.partition(":")
-    try:
-        numbers = tuple(float(g) for g in gains.split(","))
-    except ValueError:
-        numbers = ()
-    if kind != "current" or not numbers:
-        raise InputError(
-            "--effort: expected torque, or current: and the N m per A of the joints (current:0.9,1.2,...), "
-            f"got {effort!r}"
-        )
-    return arm.replace(effort=Effort.current(numbers))
+    return arm if effort is None else arm.replace(effort=parse_effort(effort))
 
 
 def picture_png(pixels: Any) -> bytes:

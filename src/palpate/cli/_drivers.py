@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..drivers.servos import ServoDriver
     from ..weigh import Session
 
-DRIVERS = ("dynamixel", "feetech")
+DRIVERS = ("dynamixel", "feetech", "ros")
 
 
 def make_driver(name: str, arm: Arm, port: str | None, bus: Path | None, rate: float) -> ServoDriver:
@@ -25,6 +25,8 @@ def make_driver(name: str, arm: Arm, port: str | None, bus: Path | None, rate: f
     """
     if name not in DRIVERS:
         raise InputError(f"no driver {name!r}; {suggest(name, DRIVERS, 'there are')}")
+    if name == "ros":
+        raise InputError("--driver ros watches an arm that others move; it cannot move one")
     if port is None:
         raise InputError(f"--driver {name} needs --port, e.g. --port /dev/ttyUSB0")
     from ..drivers.bus import Bus

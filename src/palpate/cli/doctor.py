@@ -28,6 +28,7 @@ _EXTRAS = {
     "feetech": (("scservo_sdk",), "arms of Feetech servos"),
     "ur": (("rtde_control", "rtde_receive"), "Universal Robots arms (Python up to 3.12)"),
     "fri": (("google.protobuf",), "KUKA LBR arms by FRI"),
+    "ros": (("cyclonedds", "yaml"), "ROS 2 without a ROS installation"),
     "xacro": (("xacro",), "arms from .xacro files"),
     "data": (("pooch",), "palpate data get"),
     "vision": (("cv2",), "whiteboards in pictures"),

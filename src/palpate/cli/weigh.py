@@ -40,6 +40,7 @@ from ._drivers import bus_summary, bus_words, make_driver
 if TYPE_CHECKING:
     from ..arm import Arm
     from ..drivers import Driver
+    from ..logs import Log
     from ..weigh import Session, Task, Weighing
 
 _DEFAULT_ARM = "justina_left_arm"
@@ -61,6 +62,7 @@ def add(app: typer.Typer) -> None:
             "palpate weigh --duration 6 --picture weigh.png",
             "palpate weigh task.mcap --arm robot.arm.yaml",
             "palpate weigh --driver dynamixel --port /dev/ttyUSB0 --bus bus.yaml --arm arm.yaml --pose 0,-0.5,1",
+            "palpate weigh --driver ros --topic /joint_states --arm robot.arm.yaml --duration 20",
             "palpate weigh log.csv --columns columns.yaml --arm robot.urdf --tip tool0 --effort torque",
         ),
     )(run)
@@ -137,7 +139,8 @@ def run(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="A real arm instead of a simulated one: dynamixel or feetech.",
+            help="A real arm instead of a simulated one: dynamixel or feetech; or ros, an arm that others move and "
+            "publish.",
             show_default=False,
         ),
     ] = None,
@@ -156,6 +159,28 @@ def run(
     rate: Annotated[
         float | None,
         typer.Option(metavar="HZ", help="Its control rate. [default: 250]", show_default=False),
+    ] = None,
+    topic: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="With --driver ros, where. [default: /joint_states]", show_default=False
+        ),
+    ] = None,
+    states: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND",
+            help="With --driver ros, what: joint_state or lbr_state (lbr_fri_ros2_stack). [default: joint_state]",
+            show_default=False,
+        ),
+    ] = None,
+    stamp: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CLOCK",
+            help="With --driver ros, whose time counts: header, or arrival if stamps are zero. [default: header]",
+            show_default=False,
+        ),
     ] = None,
     columns: Columns = None,
     effort: Effort = None,
@@ -185,10 +210,20 @@ def run(
         only("a real arm", "LOG is a recording", {"--driver": driver})
     else:
         only("a LOG", "nothing is recorded yet", {"--columns": columns})
+    if driver != "ros":
+        only("--driver ros", "it is not given", {"--topic": topic, "--states": states, "--stamp": stamp})
     if driver is None:
         only("a real arm", "there is no --driver", {"--port": port, "--bus": bus, "--rate": rate})
         if log is None:
             only("a LOG", "nothing is recorded yet", {"--effort": effort})
+    elif driver == "ros":
+        given = {"--mass": mass, "--start": start, "--speed": speed, "--picture": picture}
+        only("a simulation", "the arm is real", given)
+        only(
+            "an arm that palpate moves",
+            "others move this one",
+            {"--pose": pose, "--port": port, "--bus": bus},
+        )
     else:
         given = {"--mass": mass, "--start": start, "--speed": speed, "--picture": picture}
         only("a simulation", "the arm is real", given)
@@ -208,6 +243,16 @@ def run(
         model = None if arm is None else open_arm(arm, base=base, tip=tip, repair=repair, effort=effort)
         result = weighing.weigh_log(open_log(log, columns), model, estimator=estimator, observer=observer)
         title = f"What {result.arm.name} holds in {log.name}"
+    elif driver == "ros":
+        if arm is None:
+            raise InputError("--driver ros needs --arm: which arm is published?")
+        model = open_arm(arm, base=base, tip=tip, repair=repair, effort=effort)
+        watched = _watch(model, topic or "/joint_states", states, stamp, rate, duration)
+        if record:
+            files["log"] = str(_recording(out))
+            watched.save(files["log"], overwrite=True)
+        result = weighing.weigh_log(watched, model, estimator=estimator, observer=observer)
+        title = f"What {result.arm.name} holds"
     elif driver is not None:
         model = _real_arm(arm, pose, base=base, tip=tip, repair=repair)
         hardware = make_driver(driver, model, port, bus, 250.0 if rate is None else rate)
@@ -285,6 +330,25 @@ def _real_arm(arm: str | None, pose: str | None, *, base: str | None, tip: str |
     if pose is None:
         raise InputError("--driver needs --pose: where may the arm go?")
     return open_arm(arm, base=base, tip=tip, repair=repair)
+
+
+def _watch(
+    model: Arm, topic: str, states: str | None, stamp: str | None, rate: float | None, seconds: float
+) -> Log:
+    """What is published of an arm that others move."""
+    from .. import ros
+    from ..ros.source import KINDS, STAMPS
+    from ._live import interruptible
+
+    kind = next((k for k in KINDS if k == (states or KINDS[0])), None)
+    clock = next((s for s in STAMPS if s == (stamp or STAMPS[0])), None)
+    if kind is None or clock is None:
+        raise InputError(f"--states is {' or '.join(KINDS)}, --stamp is {' or '.join(STAMPS)}")
+    driver = ros.RosDriver(
+        model, topic, kind=kind, stamp=clock, rate=250.0 if rate is None else rate, patience=10.0
+    )
+    with interruptible() as stopped, driver:
+        return ros.collect(model, driver, seconds, stop=stopped)
 
 
 def _recording(out: Path) -> Path:

@@ -141,6 +141,7 @@ _ALL = (
     ),
     Study("session", "The real-time session at 1 kHz while the computer is busy", "bench", timed=True),
     Study("view", "The live page: first picture, updates, memory", "bench", timed=True),
+    Study("ros2", "ROS 2 beside Fast DDS and ros2-client; the published graph as processes", "bench"),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
 

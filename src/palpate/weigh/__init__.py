@@ -5,7 +5,7 @@ from __future__ import annotations
 from .hardware import driven_arm, present_pose
 from .proposal import TwoWayMotion, two_way_motion
 from .replay import Difference, Replay, replay
-from .scenes import Scene, find_pose, load_arm, scene, telling_pose, weight_torque
+from .scenes import Scene, find_pose, load_arm, parse_effort, scene, telling_pose, weight_torque
 from .session import (
     Moment,
     Route,
@@ -47,6 +47,7 @@ __all__ = [
     "fit_log",
     "load_arm",
     "make_pipeline",
+    "parse_effort",
     "present_pose",
     "record_moment",
     "refused",

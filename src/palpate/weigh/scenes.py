@@ -122,6 +122,28 @@ def load_arm(
     return Arm.from_urdf(path, base=base, tip=tip, repair_inertia=repair_inertia)
 
 
+def parse_effort(text: str) -> Effort:
+    """What a driver's effort is, from ``torque`` or ``current:`` and the N m per A of the joints, one or all.
+
+    Raises:
+        InputError: neither.
+        ArmError: a gain is zero.
+    """
+    if text == "torque":
+        return Effort.torque()
+    kind, _, gains = text.partition(":")
+    try:
+        numbers = tuple(float(g) for g in gains.split(","))
+    except ValueError:
+        numbers = ()
+    if kind != "current" or not numbers:
+        raise InputError(
+            "--effort: expected torque, or current: and the N m per A of the joints (current:0.9,1.2,...), "
+            f"got {text!r}"
+        )
+    return Effort.current(numbers)
+
+
 def scene(arm: Arm, *, mass: float | None = None) -> Scene:
     """How to use an arm in simulation. What its description leaves open is assumed, and said.
 

@@ -171,7 +171,11 @@ def brick(mass: float) -> Load | None:
 
 
 def simulated_driver(task: Task) -> MujocoDriver:
-    """The simulated arm of a task, closed; objects come and go as the task says."""
+    """The simulated arm of a task, with its noise, and what it will hold when; closed.
+
+    Raises:
+        MissingExtraError: mujoco is not installed.
+    """
     from ..drivers.mujoco import MujocoDriver
     from ..simulate import Attach, Release, Schedule, SensorModel
 
