@@ -12,4 +12,5 @@ NB_MODULE(_core, m) {
   palpate_py::bind_phase(m);
   palpate_py::bind_cartesian(m);
   palpate_py::bind_velocity(m);
+  palpate_py::bind_teleop(m);
 }

@@ -17,6 +17,7 @@ struct MasterConfig {
   JointVector stiffness{};          ///< of the spring between the two [N/m], >= 0; not used by force_position
   JointVector damping{};            ///< and of the damper [N s/m], >= 0
   JointVector fill{};               ///< damping felt while the tank is empty, none when it is full [N s/m], >= 0
+  JointVector contact_damping{};    ///< damping in contact, whole from 1 N felt on: it makes up for the estimate's delay [N s/m], >= 0
   JointVector hold_stiffness{};     ///< spring that holds the device while the link is dead [N/m], >= 0
   JointVector hold_damping{};       ///< and its damper [N s/m], >= 0
   JointVector acceleration{};       ///< of the device at most: how much faster it may be next period [m/s^2], >= 0
@@ -31,10 +32,11 @@ struct MasterCommand {
   Status status = Status::ok;       ///< saturated: a limit; held: the link is dead; non_finite: bad input
 };
 
-/// F = g F_env + K (x_s - x_m) + B (v_s - v_m) - d need(tank) v_m - h (K_h (x_m - x_h) + B_h v_m)      (MATH.md section 8)
+/// F = g F_env + K (x_s - x_m) + B (v_s - v_m) - (d need(tank) + c(F)) v_m - h (K_h (x_m - x_h) + B_h v_m)      (MATH.md section 8)
 ///
 /// F_env [N] force of the environment as the slave tells it; x_s, v_s the slave's place as the master's (position_position, four_channel);
-/// g gain of the link; x_h where the device was when the link died, h 1 while it is dead; need: how empty the tank is.
+/// g gain of the link; x_h where the device was when the link died, h 1 while it is dead; need: how empty the tank is;
+/// c damping in contact.
 /// Then the force limit, and last the energy: F is held for one period, so its work F (x+ - x) is known exactly, and components that do work
 /// on the hand are made smaller where the tank would be emptied (EnergyTank, passive_factor).
 class MasterSide {
@@ -45,6 +47,7 @@ class MasterSide {
       check::not_negative(check::entry("MasterConfig stiffness", i, "N/m"), c_.stiffness[i]);
       check::not_negative(check::entry("MasterConfig damping", i, "N s/m"), c_.damping[i]);
       check::not_negative(check::entry("MasterConfig fill", i, "N s/m"), c_.fill[i]);
+      check::not_negative(check::entry("MasterConfig contact_damping", i, "N s/m"), c_.contact_damping[i]);
       check::not_negative(check::entry("MasterConfig hold_stiffness", i, "N/m"), c_.hold_stiffness[i]);
       check::not_negative(check::entry("MasterConfig hold_damping", i, "N s/m"), c_.hold_damping[i]);
       check::not_negative(check::entry("MasterConfig acceleration", i, "m/s^2"), c_.acceleration[i]);
@@ -105,7 +108,7 @@ class MasterSide {
     // While it comes back, a force that the tank could not bear for a while if the hand turned round is not shown: it would jump when it does.
     const double borne = c_.passive && engaging ? passive_factor(out.force, speed, slack, n_, tank_.level(), bear_time, h) : 1.0;
     bearable_ = std::min(borne, bearable_ + bear_rate * h);
-    for (std::size_t i = 0; i < n_; ++i) out.force[i] = bearable_ * out.force[i] - c_.fill[i] * need_ * v_[i];
+    for (std::size_t i = 0; i < n_; ++i) out.force[i] = bearable_ * out.force[i] - (c_.fill[i] * need_ + c_.contact_damping[i] * std::min(1.0, std::abs(live_[i]))) * v_[i];
     if (link_.died()) {  // hold here from now on; an earlier place is let go of slowly
       for (std::size_t i = 0; i < n_; ++i) rest_[i] -= holding(i);
       anchor_ = x_;

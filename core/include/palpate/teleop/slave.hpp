@@ -51,8 +51,7 @@ struct SlaveCommand {
 ///
 /// x_t where the master points, x_w the same within the workspace, x_r the reference; s motion scale, R rotation, g gain of the link, k gain.
 /// Velocity and acceleration are limited first; a in [0, 1] is what the energy allows: the reference does the work -F_e dx_r on what it pulls,
-/// F_e the port's force, and components that do positive work are made smaller where the tank would be emptied. A reference that withdraws
-/// is never held back. Told is F = l (w(F_e) F_e + k_w (x_w - x_t)): the environment's force above the detection threshold, and the wall at the
+/// F_e the port's force, and is made slower where the tank would be emptied; a withdrawal needs no energy. Told is F = l (w(F_e) F_e + k_w (x_w - x_t)): the environment's force above the detection threshold, and the wall at the
 /// end of the workspace; l force scale. With s and l the master's energy is l/s times the slave's (J. E. Colgate, ICRA 1991), and so it is booked.
 class SlaveSide {
  public:
@@ -93,11 +92,13 @@ class SlaveSide {
         started_ = true;
       } else {
         // the force went from one sample to the other while the reference moved: the dearer of the two is booked
-        double work = 0.0;
+        double before = 0.0, after = 0.0, pushing = 0.0;
         for (std::size_t i = 0; i < n_; ++i) {
-          work += std::min(port_[i] * moved_[i], port[i] * moved_[i]);
-          work -= pushed_[i] * (x[i] - x_[i]);
+          before += port_[i] * moved_[i];
+          after += port[i] * moved_[i];
+          pushing += pushed_[i] * (x[i] - x_[i]);
         }
+        const double work = std::min(before, after) - pushing;
         tank_.exchange(power_scale * work);
       }
       x_ = x;
@@ -134,7 +135,7 @@ class SlaveSide {
       const bool free = inside[i] == target_[i];
       double wanted = coupled ? (free ? g * fresh * going[i] : 0.0) + c_.gain * (inside[i] - reference_[i]) : 0.0;
       const bool slowly = g < 1.0 || (!index && !caught_);
-      const double fastest = slowly ? std::min(c_.speed[i], c_.resync_speed[i]) : c_.speed[i];
+      const double fastest = slowly ? std::min(c_.speed[i], c_.resync_speed[i] * (index ? g : 1.0)) : c_.speed[i];
       if (std::abs(wanted) > fastest) events |= event_speed;
       wanted = std::clamp(wanted, -fastest, fastest);
       apart = apart || std::abs(inside[i] - reference_[i]) > c_.resync_speed[i] / c_.gain;
@@ -149,14 +150,14 @@ class SlaveSide {
     // what the energy allows
     if (c_.passive) {
       double out_work = 0.0;
-      for (std::size_t i = 0; i < n_; ++i) out_work += std::max(0.0, -port_[i] * step[i] + 0.5 * c_.stiffness[i] * step[i] * step[i]);
+      for (std::size_t i = 0; i < n_; ++i) out_work += -port_[i] * step[i] + 0.5 * c_.stiffness[i] * step[i] * step[i];
       // while it comes back, no faster than the tank can bear for a while: or it would stop with a jerk
       const double most = tank_.power() * h / power_scale * (g < 1.0 ? std::min(1.0, c_.tank.horizon / bear_time) : 1.0);
-      if (out_work > most) {
+      // it falls at once and rises slowly: a reference that stutters shakes the arm, and that is taken for a touch
+      allowed_ = std::min({1.0, allowed_ + allowed_rate * h, out_work > most ? most / out_work : 1.0});
+      if (allowed_ < 1.0) {
         events |= event_energy;
-        const double a = most / out_work;
-        for (std::size_t i = 0; i < n_; ++i)
-          if (-port_[i] * step[i] + 0.5 * c_.stiffness[i] * step[i] * step[i] > 0.0) step[i] *= a;
+        for (std::size_t i = 0; i < n_; ++i) step[i] *= allowed_;
       }
     }
     for (std::size_t i = 0; i < n_; ++i) {
@@ -239,7 +240,7 @@ class SlaveSide {
     return out;
   }
 
-  static constexpr double bear_time = 0.2;  // [s]
+  static constexpr double bear_time = 0.5, allowed_rate = 10.0;  // [s], [1/s]
 
   std::size_t n_;
   SlaveConfig c_;
@@ -248,6 +249,7 @@ class SlaveSide {
   FeltForce felt_;
   Message message_{};
   JointVector x_{}, port_{}, reference_{}, velocity_{}, target_{}, last_{}, moved_{}, pushed_{};
+  double allowed_ = 1.0;
   bool started_ = false, pointed_ = false, caught_ = false;
 };
 
