@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from . import arm, bench, data, doctor, excite, feel, identify, replay, reproduce, see, simulate, tare, weigh
+from . import arm, bench, data, doctor, excite, feel, identify, replay, reproduce, see, simulate, tare, teleop, weigh
 
 app = typer.Typer(
     name="palpate",
@@ -53,6 +53,7 @@ for module in (
     excite,
     arm,
     see,
+    teleop,
     reproduce,
     bench,
     data,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .._core import LinkOptions, TankOptions
 from .channel import (
     ChannelError,
     Clock,
@@ -13,15 +14,41 @@ from .channel import (
     make_key,
     read_key,
 )
+from .coupling import (
+    COUPLINGS,
+    CouplingName,
+    Event,
+    MasterCommand,
+    MasterSide,
+    SlaveCommand,
+    SlaveSide,
+    event_words,
+    felt_force,
+)
+from .masters import Hand, HapticDevice, Keys
 
 __all__ = [
+    "COUPLINGS",
     "ChannelError",
     "Clock",
+    "CouplingName",
+    "Event",
     "Faults",
     "FaultyLine",
+    "Hand",
+    "HapticDevice",
+    "Keys",
+    "LinkOptions",
+    "MasterCommand",
+    "MasterSide",
     "Message",
     "Sealer",
+    "SlaveCommand",
+    "SlaveSide",
+    "TankOptions",
     "UdpChannel",
+    "event_words",
+    "felt_force",
     "make_key",
     "read_key",
 ]

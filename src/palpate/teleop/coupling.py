@@ -303,6 +303,8 @@ class SlaveSide(_Side):
             raise InputError(str(error)) from None
         self.threshold = threshold
         """of what is felt, in standard deviations [1]"""
+        self.force_scale = force_scale
+        """force felt per force of the environment [1]"""
         super().__init__(n, session)
 
     def step(

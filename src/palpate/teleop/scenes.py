@@ -121,11 +121,9 @@ def _wall(tip: Array, stiffness: float, press: float) -> Scene:
         )
 
     deep = gap + press
-    path = through(
-        [(2.0, (0.0, 0.0, 0.0)), (4.0, (gap - 0.005, 0.0, 0.0)), (5.5, (deep, 0.0, 0.0)), (7.5, (deep, 0.0, 0.0)), (9.0, (0.0, 0.0, 0.0))]
-    )
+    path = through([(2.0, (0.0, 0.0, 0.0)), (3.5, (deep, 0.0, 0.0)), (6.5, (deep, 0.0, 0.0)), (8.5, (0.0, 0.0, 0.0))])
     text = f"press a wall on a spring of {stiffness:g} N/m, {1e3 * press:g} mm deep, and come back"
-    return Scene("wall", text, build, 1, stiffness, path, 10.0)
+    return Scene("wall", text, build, 1, stiffness, path, 9.5)
 
 
 def _surface(tip: Array, press: float) -> Scene:

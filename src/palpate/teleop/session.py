@@ -154,7 +154,7 @@ def run(
     there, back = (FaultyLine(faults or Faults(), seed + k) for k in range(2))
     sent = [0, 0]
     start = slave.x.copy()
-    reason = ""
+    reason, heard = "", False
     picked: float | None = None
     picked_at = 0.0
     for k in range(count):
@@ -204,7 +204,9 @@ def run(
         out.q[k], out.effort[k] = seen.q, slave.driver.plant.torque
         out.levels[k] = master_side.tank()["level"], slave_side.tank()["level"]
         now_reason = seen.reason or ("end of the slave's workspace" if reference.events & Event.WORKSPACE else "")
-        now_reason = "the link is dead: both hold" if (command.events | reference.events) & Event.LINK else now_reason
+        silent = bool((command.events | reference.events) & Event.LINK)
+        heard = heard or not silent
+        now_reason = "the link is dead: both hold" if heard and silent else now_reason
         if now_reason != reason:
             reason = now_reason
             if reason:

@@ -135,7 +135,8 @@ class SlaveSide {
       const bool free = inside[i] == target_[i];
       double wanted = coupled ? (free ? g * fresh * going[i] : 0.0) + c_.gain * (inside[i] - reference_[i]) : 0.0;
       const bool slowly = g < 1.0 || (!index && !caught_);
-      const double fastest = slowly ? std::min(c_.speed[i], c_.resync_speed[i] * (index ? g : 1.0)) : c_.speed[i];
+      // so slow at first that even a stop would be no jump
+      const double fastest = slowly ? std::min(c_.speed[i], c_.resync_speed[i] * (index ? g * g * g * g : 1.0)) : c_.speed[i];
       if (std::abs(wanted) > fastest) events |= event_speed;
       wanted = std::clamp(wanted, -fastest, fastest);
       apart = apart || std::abs(inside[i] - reference_[i]) > c_.resync_speed[i] / c_.gain;
