@@ -206,5 +206,6 @@ void bind_phase(nb::module_& m);
 void bind_cartesian(nb::module_& m);
 void bind_velocity(nb::module_& m);
 void bind_session(nb::module_& m);
+void bind_teleop(nb::module_& m);
 
 }  // namespace palpate_py

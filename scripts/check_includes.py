@@ -38,6 +38,7 @@ ALLOWED: dict[str, set[str]] = {
     "wrench": MODEL | {"filter"},
     "contact": MODEL | {"filter", "wrench"},
     "control": MODEL | {"filter", "trajectory"},
+    "teleop": BASE,
     "pipeline": MODEL | ESTIMATORS | {"filter"},
 }
 

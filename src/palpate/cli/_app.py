@@ -20,6 +20,7 @@ from . import (
     see,
     simulate,
     tare,
+    teleop,
     view,
     weigh,
 )
@@ -71,6 +72,7 @@ for module in (
     arm,
     see,
     ros,
+    teleop,
     reproduce,
     bench,
     data,

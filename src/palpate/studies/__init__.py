@@ -120,6 +120,7 @@ _ALL = (
     Study(
         "whiteboard", "The whiteboard project's velocity controllers, as published and corrected", "reproduce"
     ),
+    Study("teleoperation", "A hand feels what a light arm touches, without a force sensor", "reproduce"),
     Study("payload-filter", "The payload Kalman filter on the published bench", "bench"),
     Study("unknown-grasp", "The object is not held where it was thought", "bench"),
     Study("wrong-masses", "The arm's links do not weigh what the model says", "bench"),
@@ -131,6 +132,11 @@ _ALL = (
         campaign=True,
     ),
     Study("feedback", "What is weighed is fed back to the controller", "bench"),
+    Study(
+        "teleoperation-episodes",
+        "Ten thousand random teleoperators on bad networks: no energy is made",
+        "bench",
+    ),
     Study("box-inertias", "The same arm with inertias a body can have", "bench"),
     Study(
         "accuracy", "Recordings of real robots: identification, drive gains, loads, and the rivals", "bench"

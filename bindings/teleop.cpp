@@ -1,0 +1,218 @@
+// Teleoperation: the two sides, and whole episodes of a simulated teleoperator.
+#include "common.hpp"
+
+#include "palpate/teleop/episode.hpp"
+
+using namespace palpate;
+using namespace palpate::teleop;
+
+namespace palpate_py {
+namespace {
+
+nb::dict message(const Message& m, int n) {
+  nb::dict out;
+  out["session"] = m.session;
+  out["sequence"] = m.sequence;
+  out["time_ns"] = m.time_ns;
+  out["position"] = array(m.position, n);
+  out["velocity"] = array(m.velocity, n);
+  out["force"] = array(m.force, n);
+  out["energy"] = m.energy;
+  out["level"] = m.level;
+  out["engaged"] = m.engaged;
+  return out;
+}
+Message message(std::uint64_t session, std::uint64_t sequence, std::int64_t time_ns, const Vector& position, const Vector& velocity, const Vector& force, double energy,
+                double level, bool engaged, int n) {
+  return {session, sequence, time_ns, joints(position, n, "position"), joints(velocity, n, "velocity"), joints(force, n, "force"), energy, level, engaged};
+}
+nb::dict tank(const EnergyTank& t) {
+  nb::dict out;
+  out["level"] = t.level();
+  out["taken"] = t.taken();
+  out["given"] = t.given();
+  out["sent"] = t.sent();
+  out["received"] = t.received();
+  out["dissipated"] = t.dissipated();
+  out["lowest"] = t.lowest();
+  return out;
+}
+Coupling coupling(const std::string& name) {
+  if (name == "force_position") return Coupling::force_position;
+  if (name == "position_position") return Coupling::position_position;
+  expect(name == "four_channel", "coupling '" + name + "'; choose from force_position, position_position, four_channel");
+  return Coupling::four_channel;
+}
+
+struct PyMaster {
+  MasterSide side;
+  int n;
+};
+struct PySlave {
+  SlaveSide side;
+  int n;
+};
+
+/// Both sides take and give messages in the same way.
+template <class Py>
+void bind_side(nb::class_<Py>& type) {
+  type.def("receive", [](Py& self, std::uint64_t session, std::uint64_t sequence, std::int64_t time_ns, const Vector& position, const Vector& velocity, const Vector& force,
+                         double energy, double level, bool engaged) {
+        return self.side.receive(message(session, sequence, time_ns, position, velocity, force, energy, level, engaged, self.n));
+      }, nb::arg("session"), nb::arg("sequence"), nb::arg("time_ns"), nb::arg("position"), nb::arg("velocity"), nb::arg("force"), nb::arg("energy"), nb::arg("level"),
+           nb::arg("engaged"), "A message of the other side, as it came; False: old or broken, not used.")
+      .def("message", [](const Py& self) { return message(self.side.message(), self.n); }, "To be sent after each step.")
+      .def("begin", [](Py& self, std::uint64_t session) { self.side.begin(session); }, nb::arg("session"))
+      .def("tank", [](const Py& self) { return tank(self.side.tank()); })
+      .def_prop_ro("alive", [](const Py& self) { return self.side.link().alive(); })
+      .def_prop_ro("gain", [](const Py& self) { return self.side.link().gain(); })
+      .def_prop_ro("silence", [](const Py& self) { return self.side.link().silence(); });
+}
+
+nb::dict plain(const EpisodeConfig& c) {
+  nb::dict out;
+  out["coupling"] = std::array<const char*, 3>{"force_position", "position_position", "four_channel"}[static_cast<std::size_t>(c.coupling)];
+  out["axes"] = c.axes;
+  out["seconds"] = c.seconds;
+  out["delay"] = c.delay;
+  out["jitter"] = c.jitter;
+  out["loss"] = c.loss;
+  out["cut_at"] = c.cut_at;
+  out["cut"] = c.cut;
+  out["wall"] = c.wall;
+  out["hand_stiffness"] = c.hand_stiffness;
+  out["force_limit"] = c.force_limit;
+  out["speed"] = c.speed;
+  out["initial"] = 2.0 * c.tank.initial;
+  return out;
+}
+nb::dict plain(const EpisodeResult& r) {
+  nb::dict out;
+  out["generated"] = r.generated;
+  out["lowest"] = r.lowest;
+  out["force"] = r.force;
+  out["speed"] = r.speed;
+  out["shaking"] = r.shaking;
+  out["slave_shaking"] = r.slave_shaking;
+  out["drift"] = r.drift;
+  out["force_jump"] = r.force_jump;
+  out["speed_jump"] = r.speed_jump;
+  out["hold_motion"] = r.hold_motion;
+  out["felt_error"] = r.felt_error;
+  out["contact"] = r.contact;
+  out["finite"] = r.finite;
+  return out;
+}
+
+}  // namespace
+
+void bind_teleop(nb::module_& m) {
+  bind_config<TankConfig>(m, "TankOptions", "The energy tank of one side.",
+                          {{"desired", &TankConfig::desired, "level that is kept for oneself; what is above goes to the other side [J]"},
+                           {"most", &TankConfig::most, "what is above is thrown away [J]"},
+                           {"initial", &TankConfig::initial, "there without anybody having paid for it [J]"},
+                           {"horizon", &TankConfig::horizon, "no more power than level/horizon goes out [s]"},
+                           {"share", &TankConfig::share, "rate at which a poorer other side is given from the difference of the levels [1/s]"},
+                           {"surplus", &TankConfig::surplus, "and at which it is given what is above desired [1/s]"}});
+  bind_config<LinkConfig>(m, "LinkOptions", "When a link counts as dead, and how slowly it returns.",
+                          {{"timeout", &LinkConfig::timeout, "without anything new for so long the link is dead [s]"},
+                           {"ramp", &LinkConfig::ramp, "from nothing to fully coupled [s]"}});
+  bind_config<MasterConfig>(m, "MasterOptions", "The master's side, one number per axis of the device.",
+                            {{"passive", &MasterConfig::passive, "the passivity layer; False only to see what happens without"},
+                             {"force_limit", &MasterConfig::force_limit, "largest force of the device [N]"},
+                             {"stiffness", &MasterConfig::stiffness, "of the spring between the two [N/m]; not used by force_position"},
+                             {"damping", &MasterConfig::damping, "and of the damper [N s/m]"},
+                             {"fill", &MasterConfig::fill, "damping felt while the tank is empty [N s/m]"},
+                             {"contact_damping", &MasterConfig::contact_damping, "damping in contact, whole from 1 N felt on [N s/m]"},
+                             {"hold_stiffness", &MasterConfig::hold_stiffness, "spring that holds the device while the link is dead [N/m]"},
+                             {"hold_damping", &MasterConfig::hold_damping, "and its damper [N s/m]"},
+                             {"acceleration", &MasterConfig::acceleration, "of the device at most [m/s^2]"},
+                             {"resync_rate", &MasterConfig::resync_rate, "how fast the force may change while the two come together again [N/s]"},
+                             {"fade", &MasterConfig::fade, "time constant with which the force goes when the link dies [s]"}});
+  bind_config<SlaveConfig>(m, "SlaveOptions", "The slave's side, one number per axis of the slave.",
+                           {{"passive", &SlaveConfig::passive, "the passivity layer; False only to see what happens without"},
+                            {"task_space", &SlaveConfig::task_space, "the first three axes are a place in space; False: joint to joint"},
+                            {"motion_scale", &SlaveConfig::motion_scale, "motion of the slave per motion of the master [1]"},
+                            {"force_scale", &SlaveConfig::force_scale, "force felt per force of the environment [1]"},
+                            {"threshold", &SlaveConfig::threshold, "below so many standard deviations nothing is felt [1]"},
+                            {"lower", &SlaveConfig::lower, "where the reference may be [m]"},
+                            {"upper", &SlaveConfig::upper, "[m]"},
+                            {"speed", &SlaveConfig::speed, "of the reference at most [m/s]"},
+                            {"acceleration", &SlaveConfig::acceleration, "of the reference at most [m/s^2]"},
+                            {"resync_speed", &SlaveConfig::resync_speed, "while the two come together again [m/s]"},
+                            {"resync_acceleration", &SlaveConfig::resync_acceleration, "and then [m/s^2]"},
+                            {"stiffness", &SlaveConfig::stiffness, "K + 2 D/dt of spring and damper by which the slave follows [N/m]"},
+                            {"wall", &SlaveConfig::wall, "stiffness with which the end of the workspace is shown to the hand [N/m]"},
+                            {"force_limit", &SlaveConfig::force_limit, "largest force that is told or fed forward [N]"},
+                            {"gain", &SlaveConfig::gain, "with which the reference closes on the master's place [1/s]"},
+                            {"velocity_time", &SlaveConfig::velocity_time, "the master's velocity counts for so long [s]"}});
+
+  nb::class_<PyMaster> master(m, "MasterSide", "What the hand is made to feel.");
+  master
+      .def("__init__", [](PyMaster* self, int n, const MasterConfig& options, const std::string& name, const LinkConfig& link, const TankConfig& tank_options) {
+        MasterConfig c = options;
+        c.coupling = coupling(name);
+        c.link = link;
+        c.tank = tank_options;
+        new (self) PyMaster{MasterSide(n, c), n};
+      }, nb::arg("n"), nb::arg("options"), nb::arg("coupling"), nb::arg("link"), nb::arg("tank"))
+      .def("step", [](PyMaster& self, const Vector& x, const Vector& v, const Vector& hand, bool closed, double dt, std::int64_t time_ns) {
+        const MasterCommand c = self.side.step(joints(x, self.n, "x"), joints(v, self.n, "v"), joints(hand, self.n, "hand"), closed, dt, time_ns);
+        return nb::make_tuple(array(c.force, self.n), array(c.felt, self.n), static_cast<int>(c.events), c.status);
+      }, nb::arg("x"), nb::arg("v"), nb::arg("hand"), nb::arg("closed"), nb::arg("dt"), nb::arg("time_ns"), "Returns (force [N], felt [N], events, status).");
+  bind_side(master);
+
+  nb::class_<PySlave> slave(m, "SlaveSide", "Where the slave is to go, and what is told of its touch.");
+  slave
+      .def("__init__", [](PySlave* self, int n, const SlaveConfig& options, const std::string& name, const std::string& resync, const Vector& rotation, const LinkConfig& link,
+                          const TankConfig& tank_options) {
+        SlaveConfig c = options;
+        c.coupling = coupling(name);
+        expect(resync == "index" || resync == "approach", "resync '" + resync + "'; choose from index, approach");
+        c.resync = resync == "index" ? Resync::index : Resync::approach;
+        expect(rotation.shape(0) == 9, "rotation: expected 9 numbers");
+        std::copy(rotation.data(), rotation.data() + 9, c.rotation.begin());
+        c.link = link;
+        c.tank = tank_options;
+        new (self) PySlave{SlaveSide(n, c), n};
+      }, nb::arg("n"), nb::arg("options"), nb::arg("coupling"), nb::arg("resync"), nb::arg("rotation"), nb::arg("link"), nb::arg("tank"))
+      .def("step", [](PySlave& self, const Vector& x, const Vector& v, const Vector& port, const Vector& force, const Vector& std, bool allowed, double dt,
+                      std::int64_t time_ns) {
+        const int n = self.n;
+        const SlaveCommand c = self.side.step(joints(x, n, "x"), joints(v, n, "v"), joints(port, n, "port"), joints(force, n, "force"), joints(std, n, "std"), allowed, dt, time_ns);
+        return nb::make_tuple(array(c.position, n), array(c.velocity, n), array(c.force, n), array(c.felt, n), static_cast<int>(c.events), c.status);
+      }, nb::arg("x"), nb::arg("v"), nb::arg("port"), nb::arg("force"), nb::arg("std"), nb::arg("allowed"), nb::arg("dt"), nb::arg("time_ns"),
+           "Returns (reference, its velocity, force to add, felt, events, status).");
+  bind_side(slave);
+
+  m.def("teleop_events", [] {
+    nb::dict out;
+    out["link"] = static_cast<int>(event_link);
+    out["engaging"] = static_cast<int>(event_engaging);
+    out["clutch"] = static_cast<int>(event_clutch);
+    out["energy"] = static_cast<int>(event_energy);
+    out["force"] = static_cast<int>(event_force);
+    out["speed"] = static_cast<int>(event_speed);
+    out["workspace"] = static_cast<int>(event_workspace);
+    out["input"] = static_cast<int>(event_input);
+    return out;
+  }, "Bits of the events, by name.");
+  m.def("felt_force", [](const Vector& force, const Vector& std, double threshold) {
+    const std::size_t n = force.shape(0);
+    expect(std.shape(0) == n, "std: expected as many numbers as force");
+    const FeltForce felt(threshold);
+    Output<double> out({n});
+    for (std::size_t i = 0; i < n; ++i) out.data[i] = felt(force.data()[i], std.data()[i]);
+    return out.array;
+  }, nb::arg("force"), nb::arg("std"), nb::arg("threshold"));
+  m.def("teleop_episode", [](std::uint64_t seed, const std::string& layer) {
+    expect(layer == "none" || layer == "tanks" || layer == "waves", "layer '" + layer + "'; choose from none, tanks, waves");
+    EpisodeConfig c = random_episode(seed);
+    c.layer = layer == "none" ? Layer::none : layer == "tanks" ? Layer::tanks : Layer::waves;
+    EpisodeResult r;
+    unlocked([&] { r = run_episode(c, seed); });
+    return nb::make_tuple(plain(c), plain(r));
+  }, nb::arg("seed"), nb::arg("layer"), "A random episode of a simulated teleoperator: (what it was, what happened).");
+}
+
+}  // namespace palpate_py

@@ -1,0 +1,341 @@
+// Teleoperation: the laws of energy, of links that die and return, of what a hand is shown.
+#include "palpate/teleop/episode.hpp"
+
+#include <gtest/gtest.h>
+
+#include <limits>
+
+#include "no_alloc.hpp"
+#include "test_arms.hpp"
+
+using namespace palpate;
+using namespace palpate::teleop;
+using palpate_test::Random;
+
+namespace {
+
+constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+constexpr double T = 1e-3;
+
+JointVector all(double value) {
+  JointVector out{};
+  out.fill(value);
+  return out;
+}
+MasterConfig master_config(Coupling coupling = Coupling::force_position) {
+  MasterConfig c;
+  c.coupling = coupling;
+  c.link.ramp = 0.2;
+  c.force_limit = all(10.0);
+  c.stiffness = all(300.0);
+  c.damping = all(5.0);
+  c.fill = all(1.0);
+  c.hold_stiffness = all(200.0);
+  c.hold_damping = all(2.0);
+  c.acceleration = all(50.0);
+  c.resync_rate = all(150.0);
+  return c;
+}
+SlaveConfig slave_config(Coupling coupling = Coupling::force_position) {
+  SlaveConfig c;
+  c.coupling = coupling;
+  c.link.ramp = 0.2;
+  c.lower = all(-0.5);
+  c.upper = all(0.5);
+  c.speed = all(0.5);
+  c.acceleration = all(20.0);
+  c.resync_speed = all(0.05);
+  c.resync_acceleration = all(0.4);
+  c.wall = all(500.0);
+  c.force_limit = all(50.0);
+  return c;
+}
+
+/// Two sides on a line without delay; the slave is where its reference is.
+struct Pair {
+  MasterSide master;
+  SlaveSide slave;
+  JointVector at{}, velocity{}, push{};
+  MasterCommand felt{};
+  SlaveCommand command{};
+  int n;
+  explicit Pair(int axes, const MasterConfig& m = master_config(), SlaveConfig s = slave_config())
+      : master(axes, m), slave(axes, (s.task_space = axes >= 3, s)), n(axes) {
+    master.begin(1);
+    slave.begin(1);
+  }
+  void step(const JointVector& x, const JointVector& v, const JointVector& environment = {}, bool line = true, bool closed = true) {
+    felt = master.step(x, v, {}, closed, T);
+    if (line) slave.receive(master.message());
+    command = slave.step(at, velocity, environment, environment, {}, true, T);
+    if (line) master.receive(slave.message());
+    at = command.position;
+    velocity = command.velocity;
+  }
+};
+
+TEST(TeleopForce, IsNothingBelowTheThresholdAndWholeFromTwiceIt) {
+  const FeltForce felt(3.0);
+  EXPECT_EQ(felt(2.9, 1.0), 0.0);
+  EXPECT_EQ(felt(-3.0, 1.0), 0.0);
+  EXPECT_EQ(felt(6.0, 1.0), 6.0);
+  EXPECT_EQ(felt(-70.0, 1.0), -70.0);
+  EXPECT_EQ(felt(0.1, 0.0), 0.1);
+  EXPECT_EQ(felt(nan, 1.0), 0.0);
+  EXPECT_EQ(felt(5.0, nan), 0.0);
+  double last = 0.0;
+  for (int k = 0; k <= 1000; ++k) {  // grows without a step
+    const double F = felt(0.01 * k, 1.0);
+    EXPECT_GE(F, last);
+    EXPECT_LT(F - last, 0.05);
+    last = F;
+  }
+  EXPECT_THROW(FeltForce(-1.0), std::invalid_argument);
+}
+
+TEST(TeleopTank, NothingThatTheNetworkDoesMakesEnergy) {
+  Random r(3);
+  for (int trial = 0; trial < 200; ++trial) {
+    TankConfig empty;
+    empty.initial = 0.0;
+    EnergyTank a(empty), b(empty);
+    std::vector<double> way_a, way_b;
+    for (int k = 0; k < 500; ++k) {
+      for (auto [self, way] : {std::pair{&a, &way_a}, std::pair{&b, &way_b}}) {
+        const double work = r(-0.02, 0.02);
+        self->exchange(std::max(work, -std::max(0.0, self->level())));
+        self->give(r(0.0, 0.3), T);
+        for (int copies = static_cast<int>(r(0.0, 3.0)); copies > 0; --copies) way->push_back(self->sent());  // lost, once, twice
+      }
+      for (auto [self, way] : {std::pair{&a, &way_b}, std::pair{&b, &way_a}})
+        if (!way->empty() && r(0.0, 1.0) < 0.7) self->receive((*way)[static_cast<std::size_t>(r(0.0, 1.0) * static_cast<double>(way->size()))]);  // in any order
+      EXPECT_GE(a.lowest(), 0.0);
+      EXPECT_GE(b.lowest(), 0.0);
+      EXPECT_LE(a.given() + b.given(), a.taken() + b.taken() + 1e-12);
+      EXPECT_LE(a.received(), b.sent() + 1e-12);
+    }
+  }
+}
+
+TEST(TeleopTank, ANewSessionGivesNothingThatWasGivenBefore) {
+  TankConfig empty;
+  empty.initial = 0.0;
+  EnergyTank tank(empty);
+  tank.begin(5.0);
+  tank.receive(5.0);
+  EXPECT_EQ(tank.level(), 0.0);
+  tank.receive(5.1);
+  EXPECT_NEAR(tank.level(), 0.1, 1e-15);
+  tank.receive(nan);
+  tank.receive(4.0);
+  EXPECT_NEAR(tank.level(), 0.1, 1e-15);
+}
+
+TEST(TeleopLink, TakesTheNewestOnce) {
+  Link link;
+  Message m;
+  m.session = 2;
+  m.sequence = 7;
+  EXPECT_TRUE(link.receive(m, 1));
+  EXPECT_FALSE(link.receive(m, 1));
+  m.sequence = 6;
+  EXPECT_FALSE(link.receive(m, 1));
+  m.session = 1;
+  m.sequence = 100;
+  EXPECT_FALSE(link.receive(m, 1));  // of a run that has ended
+  m.session = 3;
+  m.sequence = 1;
+  EXPECT_TRUE(link.receive(m, 1));
+  m.sequence = 2;
+  m.force[0] = nan;
+  EXPECT_FALSE(link.receive(m, 1));
+  EXPECT_TRUE(link.receive([&] { m.force[0] = 0.0; return m; }(), 1));
+}
+
+TEST(TeleopPair, IsTransparentWithoutDelay) {
+  // a spring wall of 2 kN/m, touched slowly: the force of the hand is that of the wall
+  MasterConfig mc = master_config();
+  mc.force_limit = all(40.0);
+  Pair pair(1, mc);
+  double x = 0.0, most = 0.0;
+  const double wall = 0.05, K = 2e3;
+  for (int k = 0; k < 12000; ++k) {
+    const double t = k * T, v = t > 1.0 && t < 7.0 ? 0.01 : 0.0;
+    x += v * T;
+    JointVector F{};
+    F[0] = -K * std::max(0.0, pair.at[0] - wall);
+    pair.step(all(x), all(v), F);
+    if (t > 1.0) {
+      most = std::max(most, std::abs(pair.felt.felt[0] - F[0]));
+      EXPECT_NEAR(pair.at[0], x, 6e-4);
+    }
+  }
+  EXPECT_NEAR(x, 0.06, 2e-5);
+  EXPECT_NEAR(pair.felt.force[0], -K * (x - wall), 0.01 * K * 0.01);  // stiffness felt within 1 %
+  EXPECT_LT(most, 0.1);
+}
+
+TEST(TeleopPair, ScalesAndTurnsMotionAndForce) {
+  SlaveConfig sc = slave_config();
+  sc.motion_scale = 2.0;
+  sc.force_scale = 0.25;
+  sc.rotation = {0, -1, 0, 1, 0, 0, 0, 0, 1};  // slave x = -master y, slave y = master x
+  Pair pair(3, master_config(), sc);
+  JointVector x{}, v{};
+  for (int k = 0; k < 3000; ++k) {
+    if (k >= 1000 && k < 2000) x[0] += 2e-5, v[0] = 0.02;
+    else v[0] = 0.0;
+    JointVector F{};
+    if (k > 2000) F[1] = -8.0;
+    pair.step(x, v, F);
+  }
+  EXPECT_NEAR(pair.at[1], 0.04, 1e-4);
+  EXPECT_NEAR(pair.at[0], 0.0, 1e-9);
+  EXPECT_NEAR(pair.felt.felt[0], -2.0, 1e-9);
+  EXPECT_NEAR(pair.felt.felt[1], 0.0, 1e-9);
+}
+
+TEST(TeleopPair, TheClutchLetsTheHandGoBack) {
+  Pair pair(3);
+  double x = 0.0;
+  for (int stroke = 0; stroke < 3; ++stroke) {
+    for (int k = 0; k < 1500; ++k) {
+      const double v = k >= 500 && k < 1500 ? 0.1 : 0.0;
+      x += v * T;
+      pair.step(all(x), all(v));
+    }
+    for (int k = 0; k < 500; ++k) {
+      x -= 0.2 * T;
+      pair.step(all(x), all(-0.2), {}, true, false);
+      EXPECT_NE(pair.command.events & event_clutch, 0);
+    }
+  }
+  EXPECT_NEAR(x, 0.0, 1e-9);
+  EXPECT_NEAR(pair.at[0], 0.3, 5e-3);
+}
+
+TEST(TeleopPair, TheEndOfTheWorkspaceIsFelt) {
+  Pair pair(3);
+  double x = 0.0;
+  for (int k = 0; k < 8000; ++k) {
+    const double v = k > 500 && x < 0.51 ? 0.1 : 0.0;
+    x += v * T;
+    pair.step(all(x), all(v));
+    for (std::size_t i = 0; i < 3; ++i) EXPECT_LE(pair.at[i], 0.5 + 1e-12);
+  }
+  EXPECT_NE(pair.command.events & event_workspace, 0);
+  EXPECT_NEAR(pair.felt.felt[0], -500.0 * 0.01, 0.2);
+}
+
+TEST(TeleopPair, HoldsWhenTheLinkDiesAndReturnsWithoutAJump) {
+  for (const Resync resync : {Resync::index, Resync::approach}) {
+    SlaveConfig sc = slave_config();
+    sc.resync = resync;
+    sc.link.ramp = 1.0;
+    MasterConfig mc = master_config();
+    mc.link.ramp = 1.0;
+    Pair pair(1, mc, sc);
+    double x = 0.0, held = 0.0, force = 0.0, speed = 0.0;
+    for (int k = 0; k < 9000; ++k) {
+      const bool line = k < 2000 || k >= 5000;
+      const double v = k < 5000 && k > 500 ? 0.02 : 0.0;
+      x += v * T;
+      const double touching = resync == Resync::index ? -1e3 * std::max(0.0, pair.at[0] - 0.03) : 0.0;
+      const double F = pair.felt.force[0], V = pair.velocity[0];
+      pair.step(all(x), all(v), all(touching), line);
+      if (k == 2300) held = pair.at[0];
+      if (k > 2300 && k < 5000) {
+        EXPECT_EQ(pair.at[0], held);
+        EXPECT_EQ(pair.felt.status, Status::held);
+        EXPECT_NE(pair.command.events & event_link, 0);
+      }
+      if (k >= 5000) {
+        force = std::max(force, std::abs(pair.felt.force[0] - F));
+        speed = std::max(speed, std::abs(pair.velocity[0] - V));
+        EXPECT_LE(std::abs(pair.velocity[0]), 0.051);
+      }
+    }
+    EXPECT_LT(force, 0.2) << "in one period";
+    EXPECT_LT(speed, 5e-3);
+    if (resync == Resync::index) EXPECT_NEAR(pair.at[0], held, 2e-3);
+    else EXPECT_NEAR(pair.at[0], x, 1e-3);
+  }
+}
+
+TEST(TeleopPair, BrokenInputIsHeldAndSaid) {
+  Pair pair(1);
+  for (int k = 0; k < 1000; ++k) pair.step(all(0.01), all(0.0), all(-2.0));
+  const JointVector before = pair.at;
+  const MasterCommand m = pair.master.step(all(nan), all(0.0), {}, true, T);
+  EXPECT_EQ(m.force[0], 0.0);
+  EXPECT_EQ(m.status, Status::non_finite);
+  EXPECT_NE(m.events & event_input, 0);
+  EXPECT_FALSE(pair.master.message().engaged);
+  const SlaveCommand s = pair.slave.step(all(nan), {}, {}, {}, {}, true, T);
+  EXPECT_EQ(s.position[0], before[0]);
+  EXPECT_EQ(s.status, Status::non_finite);
+  EXPECT_EQ(pair.slave.step(before, {}, {}, {}, {}, true, -1.0).status, Status::non_finite);
+}
+
+TEST(TeleopPair, SaysWhatItExpects) {
+  MasterConfig mc = master_config();
+  mc.force_limit[0] = 0.0;
+  EXPECT_THROW(MasterSide(1, mc), std::invalid_argument);
+  SlaveConfig sc = slave_config();
+  sc.upper[2] = -1.0;
+  EXPECT_THROW(SlaveSide(3, sc), std::invalid_argument);
+  EXPECT_THROW(SlaveSide(2, slave_config()), std::invalid_argument);  // task space has three axes
+  EXPECT_THROW(SlaveSide(17, slave_config()), std::invalid_argument);
+}
+
+TEST(TeleopWaves, AConstantDelayTakesNothingAndMakesNothing) {
+  const WaveLine line(20.0);
+  Random r(5);
+  std::vector<double> there(300, 0.0), back(300, 0.0);
+  double energy = 0.0, v = 0.0, F = 0.0;
+  for (std::size_t k = 0; k < 20000; ++k) {
+    v = 0.99 * v + r(-0.01, 0.01);
+    F = 0.99 * F + r(-1.0, 1.0);
+    const auto m = line.master(v, back[k % 300]);
+    const auto s = line.slave(F, there[k % 300]);
+    energy += T * (-m.force * v - F * s.velocity);  // taken from the hand, given to the slave
+    EXPECT_GE(energy, -1e-9);
+    there[k % 300] = m.wave;
+    back[k % 300] = s.wave;
+  }
+}
+
+TEST(TeleopEpisodes, NoEnergyIsMadeAndNoLimitBroken) {
+  int shaking = 0;
+  for (std::uint64_t seed = 0; seed < 60; ++seed) {
+    EpisodeConfig c = random_episode(seed);
+    const EpisodeResult r = run_episode(c, seed);
+    EXPECT_LE(r.generated, 2.0 * c.tank.initial) << seed;
+    EXPECT_GE(r.lowest, 0.0) << seed;
+    EXPECT_LE(r.force, c.force_limit * (1.0 + 1e-12)) << seed;
+    EXPECT_LE(r.speed, c.speed * (1.0 + 1e-9)) << seed;
+    EXPECT_LE(r.force_jump, 2.0) << seed;
+    EXPECT_EQ(r.hold_motion, 0.0) << seed;
+    EXPECT_TRUE(r.finite) << seed;
+    c.layer = Layer::none;
+    shaking += run_episode(c, seed).generated > 0.1;
+  }
+  EXPECT_GT(shaking, 20);  // the same without the layer
+}
+
+TEST(TeleopEpisodes, AreTheSameEveryTime) {
+  const EpisodeConfig c = random_episode(7);
+  const EpisodeResult a = run_episode(c, 7), b = run_episode(c, 7);
+  EXPECT_EQ(a.generated, b.generated);
+  EXPECT_EQ(a.shaking, b.shaking);
+  EXPECT_EQ(a.force_jump, b.force_jump);
+}
+
+TEST(TeleopPair, AStepAllocatesNothing) {
+  Pair pair(6, master_config(Coupling::four_channel), slave_config(Coupling::four_channel));
+  palpate::test::AllocationCounter counter;
+  for (int k = 0; k < 100; ++k) pair.step(all(1e-4 * k), all(0.1), all(-1.0));
+  EXPECT_EQ(counter.count(), 0u);
+}
+
+}  // namespace

@@ -1,0 +1,149 @@
+"""Masters: a simulated haptic device in a simulated hand, keys and sticks; all give a place and take a force."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..arm import Array
+from ..errors import InputError
+
+_SUBSTEPS = 5
+
+
+def _nowhere(time: float) -> Array:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True)
+class Hand:
+    """An arm of a person, as it is felt at the hand: m x'' = K (x_i - x) - B x' + tremor + F.
+
+    Source: the second-order impedance of N. Hogan, IEEE TAC 29(8), 1984; figures of a relaxed to firm grip are 200 to 800 N/m and damping
+    ratios of 0.2 to 0.6. Tremor: 8 to 12 Hz.
+
+    Raises:
+        InputError: a number is out of range.
+    """
+
+    wish: Callable[[float], Array] = _nowhere
+    """where the hand wants to be at a time [s], (3,) [m]"""
+    mass: float = 0.5
+    """[kg]"""
+    stiffness: float = 400.0
+    """[N/m]"""
+    damping: float = 14.0
+    """[N s/m]"""
+    tremor: float = 0.05
+    """amplitude, each axis [N]"""
+    tremor_rate: float = 9.0
+    """[Hz]"""
+
+    def __post_init__(self) -> None:
+        if not self.mass > 0.0 or min(self.stiffness, self.damping, self.tremor) < 0.0:
+            raise InputError(f"a hand needs mass > 0 and stiffness, damping, tremor >= 0, got {self!r}")
+
+    def force(self, time: float, x: Array, v: Array) -> Array:
+        """(3,) of the hand on the device, without its own mass [N]."""
+        shake = self.tremor * np.sin(2.0 * math.pi * self.tremor_rate * time + np.array([0.0, 2.0, 4.0]))
+        pull: Array = self.stiffness * (self.wish(time) - x) - self.damping * v + shake
+        return pull
+
+
+@dataclass(slots=True)
+class HapticDevice:
+    """A simulated desktop device with three force axes, held by a :class:`Hand`.
+
+    Mass, largest force and resolution are those a maker publishes for the PHANTOM Premium 1.5: 75 g apparent mass, 8.5 N, 0.03 mm.
+    """
+
+    hand: Hand
+    mass: float = 0.075
+    """apparent [kg]"""
+    force_limit: float = 8.5
+    """[N]"""
+    resolution: float = 3e-5
+    """[m]"""
+    friction: float = 0.04
+    """viscous [N s/m]: 0.04 N of backdrive friction at 1 m/s"""
+    x: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) [m]"""
+    v: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) [m/s]"""
+    time: float = 0.0
+    """[s]"""
+
+    def step(self, force: Array, dt: float) -> None:
+        """Hold a force (3,) [N] of the device on the hand for a period [s]."""
+        F = np.clip(force, -self.force_limit, self.force_limit)
+        h, mass = dt / _SUBSTEPS, self.mass + self.hand.mass
+        for _ in range(_SUBSTEPS):
+            self.v = self.v + (h / mass) * (F + self.hand.force(self.time, self.x, self.v) - self.friction * self.v)
+            self.x = self.x + h * self.v
+            self.time += h
+
+    def read(self) -> tuple[Array, Array]:
+        """(3,) place as the encoders give it [m], (3,) velocity [m/s]."""
+        return np.round(self.x / self.resolution) * self.resolution, self.v.copy()
+
+
+class Keys:
+    """Keyboard, gamepad or SpaceMouse as a master: buttons and sticks give a velocity; what is felt can only be shown.
+
+    Args:
+        speed: with a key down or a stick at its end [m/s].
+        smooth: time constant of starting and stopping [s].
+        bindings: which key moves where; None: w a s d in the plane, q and e up and down.
+    """
+
+    BINDINGS: Mapping[str, tuple[float, float, float]] = {
+        "w": (1.0, 0.0, 0.0),
+        "s": (-1.0, 0.0, 0.0),
+        "a": (0.0, 1.0, 0.0),
+        "d": (0.0, -1.0, 0.0),
+        "q": (0.0, 0.0, 1.0),
+        "e": (0.0, 0.0, -1.0),
+    }
+
+    def __init__(
+        self,
+        speed: float = 0.1,
+        smooth: float = 0.05,
+        bindings: Mapping[str, tuple[float, float, float]] | None = None,
+    ) -> None:
+        if not (speed > 0.0 and smooth > 0.0):
+            raise InputError(f"speed and smooth must be > 0, got {speed!r} and {smooth!r}")
+        self._speed, self._smooth = speed, smooth
+        self._bindings = dict(self.BINDINGS if bindings is None else bindings)
+        self._down: set[str] = set()
+        self._stick = np.zeros(3)
+        self._x, self._v = np.zeros(3), np.zeros(3)
+
+    def press(self, key: str) -> bool:
+        """A key goes down; False: it is bound to nothing."""
+        if key in self._bindings:
+            self._down.add(key)
+        return key in self._bindings
+
+    def release(self, key: str) -> None:
+        """A key goes up."""
+        self._down.discard(key)
+
+    def stick(self, x: float, y: float, z: float) -> None:
+        """Sticks of a gamepad or the cap of a SpaceMouse, each from -1 to 1."""
+        self._stick = np.clip(np.nan_to_num([x, y, z]), -1.0, 1.0)
+
+    def step(self, dt: float) -> None:
+        """Go on by a period [s]."""
+        wanted = sum((np.array(self._bindings[k]) for k in self._down), self._stick)
+        size = float(np.linalg.norm(wanted))
+        wanted = self._speed * wanted / max(1.0, size)
+        self._v = self._v - math.expm1(-dt / self._smooth) * (wanted - self._v)
+        self._x = self._x + dt * self._v
+
+    def read(self) -> tuple[Array, Array]:
+        """(3,) place [m], (3,) velocity [m/s]."""
+        return self._x.copy(), self._v.copy()

@@ -1,0 +1,135 @@
+"""A run as one log of both sides, and as a report."""
+
+from __future__ import annotations
+
+import math
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from .._core import __version__
+from ..logs import Recorder
+from ..report import StudyRow, joints_figure, write_study
+from .coupling import Event, event_words
+from .figures import Transparency, jumps, transparency
+from .session import Cut, Run
+from .setups import Setup
+
+_SIGNALS = {
+    "master_position": ("device", "m"),
+    "master_velocity": ("device_velocity", "m/s"),
+    "master_force": ("force", "N"),
+    "master_felt": ("felt", "N"),
+    "slave_tip": ("tip", "m"),
+    "slave_reference": ("reference", "m"),
+    "slave_force": ("estimated", "N"),
+    "slave_force_std": ("std", "N"),
+    "true_force": ("true", "N"),
+    "tank_levels": ("levels", "J"),
+}
+
+
+def record(run: Run, setup: Setup, path: str | PathLike[str], *, overwrite: bool = False) -> Path:
+    """Write both sides of a run into one recording, on the master's clock.
+
+    The joint states are the slave's; what belongs to the master has a name that says so.
+
+    Raises:
+        LogError: the path exists, or cannot be written.
+    """
+    arm = setup.slave.model
+    session = {
+        "what": "teleoperation" if setup.scene is None else f"teleoperation: {setup.scene.text}",
+        "palpate": __version__,
+        "clock_offset_s": f"{run.offset:.9g}",
+        "round_trip_s": f"{run.round_trip:.9g}",
+        "motion_scale": f"{setup.motion_scale:g}",
+    }
+    with Recorder(path, arm.joint_names, session=session, overwrite=overwrite) as out:
+        events = list(run.reasons)
+        for k, time in enumerate(run.time):
+            now = round(time * 1e9)
+            while events and events[0][0] <= time:
+                out.event(now, "held", events.pop(0)[1])
+            out.sample(now, run.q[k], None, run.effort[k])
+            for name, (column, unit) in _SIGNALS.items():
+                out.signal(name, now, getattr(run, column)[k], unit)
+            out.signal("master_events", now, float(run.master_events[k]))
+            out.signal("slave_events", now, float(run.slave_events[k]))
+        for time, _, mass, std in run.held:
+            out.payload(round(time * 1e9), mass, std)
+    return Path(path)
+
+
+def found(run: Run, setup: Setup, cuts: tuple[Cut, ...] = ()) -> Transparency:
+    """The figures of a run in its setup; `cuts` is taken for what it is: nothing is judged while the link is dead."""
+    scale, stiffness = setup.follower.force_scale, None if setup.scene is None else setup.scene.stiffness
+    return transparency(run, force_scale=scale, stiffness=None if cuts else stiffness)
+
+
+def rows(run: Run, setup: Setup, cuts: tuple[Cut, ...] = ()) -> list[StudyRow]:
+    """What was found, for people; nothing is judged."""
+    t = found(run, setup, cuts)
+
+    def row(what: str, value: float, unit: str, note: str = "") -> StudyRow | None:
+        return StudyRow(what, ours=value, unit=unit, note=note) if math.isfinite(value) else None
+
+    contact_error = float(np.abs(np.linalg.norm(run.estimated - run.true, axis=1)).mean())
+    every = [
+        row("tool away from where the hand points, nothing touched, at most", 1e3 * t.tracking, "mm"),
+        row("force of the device, nothing touched, at most", t.free_force, "N"),
+        row("force felt off the true one, mean", 100.0 * t.force_error, "%", f"while {t.force_held:.3g} N are held"),
+        row("stiffness felt, part of what the tool meets", 100.0 * t.stiffness, "%"),
+        row("felt after the touch", 1e3 * t.onset, "ms"),
+        row("estimated against true force, mean", contact_error, "N"),
+        row("largest true force", float(np.linalg.norm(run.true, axis=1).max(initial=0.0)), "N"),
+    ]
+    for time, true, mass, std in run.held:
+        every.append(row(f"object lifted at {time:.1f} s, of {true:g} kg: weighed", mass, "kg", f"± {1.96 * std:.3f} kg (95 %)"))
+    if cuts:
+        force, speed, moved = jumps(run, cuts)
+        every += [
+            row("dead link: force changes within 10 ms of the return by at most", force, "N"),
+            row("dead link: velocity of the tool changes within 10 ms by at most", 1e3 * speed, "mm/s"),
+            row("dead link: the slave's reference moves meanwhile", 1e3 * moved, "mm"),
+        ]
+    for side, tank in run.tanks.items():
+        every.append(row(f"{side}: energy taken less given at the port", tank["taken"] - tank["given"], "J"))
+    every += [
+        row("bandwidth, to the slave and back", max(run.bandwidth) / 1e6, "Mbit/s", f"{run.bandwidth[0] / 1e6:.2f} and {run.bandwidth[1] / 1e6:.2f}"),
+        row("round trip of the quickest message", 1e3 * run.round_trip, "ms"),
+    ]
+    return [r for r in every if r is not None]
+
+
+def write_report(run: Run, setup: Setup, path: str | PathLike[str], *, settings: dict[str, object], cuts: tuple[Cut, ...] = ()) -> Path:
+    """Write a run as one self-contained HTML file, with its rows as Markdown and JSON beside it.
+
+    Raises:
+        InputError: a file cannot be written.
+        MissingExtraError: matplotlib is not installed.
+    """
+    scale = setup.follower.force_scale
+    axes = ("x", "y", "z")
+    forces = {"true": run.true, "estimated": run.estimated, "felt": run.felt / scale}
+    places = {"where the hand points": run.wanted, "tool": run.tip}
+    figures = {
+        "Force on the tool along the base's axes: true (MuJoCo), estimated without a force sensor, and felt by the hand": joints_figure(
+            run.time, forces, axes, quantity="force", unit="N"
+        ),
+        "Where the hand points, and where the tool is": joints_figure(run.time, places, axes, quantity="place", unit="m"),
+        "Energy in the tanks of the two sides": joints_figure(
+            run.time, {"level": run.levels}, ("master", "slave"), quantity="energy", unit="J"
+        ),
+    }
+    told = [f"{time:.3f} s: {reason}" for time, reason in run.reasons]
+    seen = np.bitwise_or.reduce(np.concatenate((run.master_events, run.slave_events))) if len(run.time) else 0
+    told += [f"happened: {words}" for words in event_words(int(Event(int(seen)))).split("; ") if words]
+    told += [f"{count} packets refused: {kind}" for kind, count in run.refused.items()]
+    told += [f"assumed: {sentence}" for sentence in setup.assumed]
+    title = "Teleoperation" if setup.scene is None else f"Teleoperation: {setup.scene.text}"
+    files = write_study(
+        rows(run, setup, cuts), figures, path, title=title, text="palpate teleop", settings=settings, provenance=told
+    )
+    return files.html

@@ -1,0 +1,259 @@
+"""What there is to touch: a spring wall of known stiffness, a surface, a hole for a peg, objects to lift."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from .. import robots
+from ..arm import Arm, Array, Sensing, Shape
+from ..errors import InputError, suggest
+from ..simulate._model import mujoco
+
+SceneName: TypeAlias = Literal["wall", "surface", "peg", "lift"]
+
+PROBE = 0.015
+"""radius of the tool's tip [m]"""
+TOOL = 0.12
+"""from the flange to the centre of the tip [m]"""
+PEG_GAP = 0.0015
+"""between peg and hole, on each side [m]"""
+_PANEL_MASS = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Something to touch, seen from the tool's tip at the start.
+
+    Attributes:
+        name: which one.
+        text: what it is and what to do, for people.
+        build: adds it to a MjSpec; None: nothing.
+        joints: MuJoCo joints that it adds.
+        stiffness: of the wall [N/m]; None: there is none.
+        path: where the hand goes, times [s] to (3,) [m] from its start, in the slave's axes and scale.
+        seconds: how long that takes.
+        masses: objects taken and put down, (time [s], mass [kg]).
+    """
+
+    name: SceneName
+    text: str
+    build: Callable[[Any], None] | None
+    joints: int
+    stiffness: float | None
+    path: Callable[[float], Array]
+    seconds: float
+    masses: tuple[tuple[float, float], ...] = ()
+
+
+def smooth(x: float) -> float:
+    """Quintic from 0 to 1."""
+    x = min(1.0, max(0.0, x))
+    return x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+
+
+def through(points: list[tuple[float, tuple[float, float, float]]]) -> Callable[[float], Array]:
+    """From rest to rest through points (time [s], place [m])."""
+    times = [t for t, _ in points]
+    places = np.array([p for _, p in points])
+
+    def path(time: float) -> Array:
+        k = int(np.searchsorted(times, time, side="right")) - 1
+        if k < 0:
+            return places[0].copy()
+        if k + 1 >= len(times):
+            return places[-1].copy()
+        part = smooth((time - times[k]) / (times[k + 1] - times[k]))
+        found: Array = places[k] + part * (places[k + 1] - places[k])
+        return found
+
+    return path
+
+
+def find(name: str, tip: Array, *, stiffness: float = 2000.0, press: float = 0.02, masses: tuple[float, ...] = (0.5, 1.2)) -> Scene:
+    """The scene of that name, placed for a tool whose tip is at `tip` (3,) [m] in the slave's base frame.
+
+    Args:
+        name: wall, surface, peg or lift.
+        tip: (3,) [m].
+        stiffness: of the wall [N/m].
+        press: how far the hand goes beyond the touch [m].
+        masses: of the objects to lift [kg].
+
+    Raises:
+        InputError: no such scene, or a number is out of range.
+    """
+    makers: dict[str, Callable[[], Scene]] = {
+        "wall": lambda: _wall(tip, stiffness, press),
+        "surface": lambda: _surface(tip, press),
+        "peg": lambda: _peg(tip),
+        "lift": lambda: _lift(masses),
+    }
+    if name not in makers:
+        raise InputError(f"no scene {name!r}; {suggest(str(name), makers, 'there are')}")
+    if not (10.0 <= stiffness <= 1e6 and 0.0 < press <= 0.2):
+        raise InputError(f"stiffness must be 10 to 1e6 N/m and press above 0 to 0.2 m, got {stiffness!r} and {press!r}")
+    return makers[name]()
+
+
+def _wall(tip: Array, stiffness: float, press: float) -> Scene:
+    gap = 0.05
+
+    def build(spec: Any) -> None:
+        mj = mujoco()
+        panel = spec.worldbody.add_body(name="panel", pos=(tip[0] + gap + PROBE + 0.01, tip[1], tip[2]))
+        slide = panel.add_joint(name="panel", axis=(1.0, 0.0, 0.0))
+        slide.type = mj.mjtJoint.mjJNT_SLIDE
+        slide.stiffness[0] = stiffness
+        slide.damping[0] = 2.0 * 0.3 * (stiffness * _PANEL_MASS) ** 0.5
+        panel.gravcomp = 1.0
+        panel.add_geom(
+            name="panel",
+            type=mj.mjtGeom.mjGEOM_BOX,
+            size=(0.01, 0.1, 0.05),
+            mass=_PANEL_MASS,
+            rgba=(0.55, 0.68, 0.5, 1.0),
+            friction=(0.3, 0.005, 0.0001),
+            solref=(0.002, 1.0),
+        )
+
+    deep = gap + press
+    path = through([(2.0, (0.0, 0.0, 0.0)), (3.5, (deep, 0.0, 0.0)), (6.5, (deep, 0.0, 0.0)), (8.5, (0.0, 0.0, 0.0))])
+    text = f"press a wall on a spring of {stiffness:g} N/m, {1e3 * press:g} mm deep, and come back"
+    return Scene("wall", text, build, 1, stiffness, path, 9.5)
+
+
+def _surface(tip: Array, press: float) -> Scene:
+    gap = 0.03
+    slope = 0.15  # [rad]
+
+    def build(spec: Any) -> None:
+        mj = mujoco()
+        c, s = np.cos(0.5 * slope), np.sin(0.5 * slope)
+        normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
+        touch = np.asarray(tip) - np.array([0.0, 0.0, gap + PROBE])
+        spec.worldbody.add_geom(
+            name="surface",
+            type=mj.mjtGeom.mjGEOM_BOX,
+            size=(0.4, 0.4, 0.02),
+            pos=touch - 0.02 * normal,
+            quat=(c, 0.0, s, 0.0),
+            rgba=(0.62, 0.56, 0.46, 1.0),
+            friction=(0.4, 0.005, 0.0001),
+            solref=(0.004, 1.0),
+        )
+
+    down = -gap - press
+    fall = -np.tan(slope)
+    path = through(
+        [
+            (2.0, (0.0, 0.0, 0.0)),
+            (4.0, (0.0, 0.0, down)),
+            (7.0, (0.1, 0.0, down + 0.1 * fall)),
+            (9.0, (0.1, 0.1, down + 0.1 * fall)),
+            (11.0, (0.0, 0.1, down)),
+            (12.5, (0.0, 0.1, 0.0)),
+        ]
+    )
+    return Scene("surface", f"trace a surface that falls by {np.degrees(slope):.0f} degrees, pressing lightly", build, 0, None, path, 13.5)
+
+
+def _peg(tip: Array) -> Scene:
+    gap, depth, off = 0.03, 0.03, 0.004
+
+    def build(spec: Any) -> None:
+        mj = mujoco()
+        hole = PROBE + PEG_GAP
+        width, top = 0.04, tip[2] - PROBE - gap
+        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            away = hole + width
+            size = (width, 2.0 * width + hole, depth) if dx else (hole, width, depth)
+            spec.worldbody.add_geom(
+                type=mj.mjtGeom.mjGEOM_BOX,
+                size=size,
+                pos=(tip[0] + dx * away, tip[1] + dy * away, top - depth),
+                rgba=(0.5, 0.52, 0.58, 1.0),
+                friction=(0.2, 0.005, 0.0001),
+                solref=(0.004, 1.0),
+            )
+
+    # the hand misses the hole at first and slides into it
+    path = through(
+        [
+            (2.0, (0.0, 0.0, 0.0)),
+            (4.0, (off, 0.0, -gap + 0.003)),
+            (5.0, (off, 0.0, -gap - 0.004)),
+            (7.0, (-0.001, 0.0, -gap - 0.006)),
+            (9.0, (0.0, 0.0, -gap - 0.03)),
+            (11.0, (0.0, 0.0, -gap - 0.03)),
+            (13.0, (0.0, 0.0, 0.0)),
+        ]
+    )
+    return Scene("peg", f"put a peg into a hole {1e3 * PEG_GAP:g} mm wider on each side, missing it at first", build, 0, None, path, 14.0)
+
+
+def _lift(masses: tuple[float, ...]) -> Scene:
+    if not masses or any(not 0.0 < m <= 20.0 for m in masses):
+        raise InputError(f"masses to lift must be above 0 to 20 kg, got {masses!r}")
+    events: list[tuple[float, float]] = []
+    points: list[tuple[float, tuple[float, float, float]]] = [(2.0, (0.0, 0.0, 0.0))]
+    time = 2.0
+    for mass in masses:
+        events += [(time + 1.0, mass), (time + 7.0, 0.0)]
+        points += [(time + 1.5, (0.0, 0.0, 0.0)), (time + 3.0, (0.0, 0.0, 0.1)), (time + 5.0, (0.0, 0.1, 0.1)), (time + 6.5, (0.0, 0.0, 0.0))]
+        time += 8.0
+    return Scene("lift", f"lift {len(masses)} objects whose masses nobody knows, and weigh them", None, 0, None, through(points), time + 1.0, tuple(events))
+
+
+# --- arms with a tool -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlaveArm:
+    """An arm with a tool in its hand, and how it stands.
+
+    Attributes:
+        arm: with the tool as a shape, its grasp point at the centre of the tool's tip.
+        q: (n,) pose at the start [rad].
+        force_scale: force felt per force of the environment, so that the device's range fits the arm's [1].
+        assumed: what no source states and was taken, one sentence each.
+    """
+
+    arm: Arm
+    q: Array
+    force_scale: float
+    assumed: tuple[str, ...]
+
+
+_POSES = {
+    "kuka_lbr_iiwa14": (0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
+    "kuka_lbr_iiwa7": (0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
+}
+
+
+def slave_arm(name: str) -> SlaveArm:
+    """A reference arm that can be a slave here, with a tool.
+
+    Raises:
+        InputError: no such slave.
+    """
+    if name not in _POSES:
+        raise InputError(f"no slave {name!r}; {suggest(str(name), _POSES, 'there are')}")
+    bare = robots.load(name)
+    T = bare.T_last_tip
+    centre = np.eye(4)
+    centre[:3, :3] = T[:3, :3]
+    centre[:3, 3] = T[:3, :3] @ np.array([0.0, 0.0, 0.5 * TOOL]) + T[:3, 3]
+    tool = Shape(kind="capsule", size=(PROBE, TOOL), T=centre, link=bare.n - 1, rgba=(0.3, 0.3, 0.34, 1.0))
+    sensing = Sensing(position_resolution=1e-6, position_std=0.0, velocity_std=1e-4, torque_std=0.05)
+    joints = tuple(j.replace(sensing=sensing) for j in bare.joints)
+    arm = bare.replace(joints=joints, shapes=(*bare.shapes, tool), grasp=np.array([0.0, 0.0, TOOL]))
+    return SlaveArm(
+        arm,
+        np.array(_POSES[name]),
+        1.0,
+        ("encoders of 1 microradian, velocities with 0.1 mrad/s and torques with 0.05 N m of noise at 1 kHz: no source states them",),
+    )

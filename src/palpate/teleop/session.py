@@ -1,0 +1,232 @@
+"""A teleoperator in one process, period by period: hand, device, both sides, the packets between them, the slave, what really happened."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arm import Array
+from ..errors import InputError
+from .channel import Faults, FaultyLine, Sealer
+from .coupling import Event, MasterSide, SlaveSide, felt_force
+from .masters import HapticDevice
+from .slaves import SimulatedSlave
+
+Progress: TypeAlias = Callable[[float, float], None]
+"""told the simulated time and the whole time [s], now and then"""
+
+PERIOD = 1e-3
+"""[s]"""
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """The link dies for a while."""
+
+    at: float
+    """[s]"""
+    seconds: float
+    """[s]"""
+
+
+@dataclass(slots=True, eq=False)
+class Run:
+    """What happened, one row per period; (N, 3) in base axes of the slave, but the device's own columns.
+
+    Attributes:
+        time: (N,) [s].
+        device, device_velocity: of the haptic device, its axes and scale [m, m/s].
+        wanted: where the device points, the slave's axes and scale [m].
+        tip, tip_velocity: of the slave's tool [m, m/s].
+        reference: of the slave [m].
+        force: of the device on the hand, device axes [N].
+        felt: of it, what the environment does [N].
+        estimated, std: force of the environment by the pipeline [N].
+        true: the same from MuJoCo [N].
+        master_events, slave_events: (N,) Event bits.
+        levels: (N, 2) of the tanks, master and slave [J].
+        q: (N, n) of the slave's joints [rad].
+        effort: (N, n) as the driver gave it.
+        reasons: (time [s], text): what held or slowed down, when it began.
+        offset, round_trip: of the slave's clock against the master's [s]; 0 for one clock.
+        bandwidth: (2,) from master to slave and back [bit/s].
+        refused: packets not taken, by reason.
+        tanks: energies of both sides at the end [J].
+        held: (time [s], true [kg], weighed [kg], std [kg]) of objects lifted.
+    """
+
+    time: Array
+    device: Array
+    device_velocity: Array
+    wanted: Array
+    tip: Array
+    tip_velocity: Array
+    reference: Array
+    force: Array
+    felt: Array
+    estimated: Array
+    std: Array
+    true: Array
+    master_events: npt.NDArray[np.int64]
+    slave_events: npt.NDArray[np.int64]
+    levels: Array
+    q: Array
+    effort: Array
+    reasons: list[tuple[float, str]] = field(default_factory=list)
+    offset: float = math.nan
+    round_trip: float = math.nan
+    bandwidth: tuple[float, float] = (0.0, 0.0)
+    refused: dict[str, int] = field(default_factory=dict)
+    tanks: dict[str, dict[str, float]] = field(default_factory=dict)
+    held: list[tuple[float, float, float, float]] = field(default_factory=list)
+
+    @classmethod
+    def empty(cls, count: int, n: int) -> Run:
+        """Room for `count` periods of a slave with `n` joints."""
+        three = {
+            name: np.zeros((count, 3))
+            for name in (
+                "device device_velocity wanted tip tip_velocity reference force felt estimated std true".split()
+            )
+        }
+        return cls(
+            time=np.arange(count) * PERIOD,
+            master_events=np.zeros(count, dtype=np.int64),
+            slave_events=np.zeros(count, dtype=np.int64),
+            levels=np.zeros((count, 2)),
+            q=np.zeros((count, n)),
+            effort=np.zeros((count, n)),
+            **three,
+        )
+
+
+def run(
+    device: HapticDevice,
+    slave: SimulatedSlave,
+    master_side: MasterSide,
+    slave_side: SlaveSide,
+    seconds: float,
+    *,
+    motion_scale: float = 1.0,
+    faults: Faults | None = None,
+    cuts: tuple[Cut, ...] = (),
+    closed: Callable[[float], bool] = lambda time: True,
+    weigh: bool = False,
+    progress: Progress | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    seed: int = 0,
+) -> Run:
+    """Run both sides in lock-step over a line with faults; every message goes through the encrypted packets of the channel.
+
+    Args:
+        device: held by its hand.
+        slave: in its scene.
+        master_side: what the hand feels.
+        slave_side: where the slave goes.
+        seconds: how long.
+        motion_scale: that of the slave's side, for the column `wanted`.
+        faults: of the network, each way; None: none.
+        cuts: when the link is dead.
+        closed: the clutch at a time [s].
+        weigh: weigh what is lifted, from the force at rest.
+        progress: told how far it is.
+        stop: asked now and then; True ends the run there.
+        seed: of the faults and the packets' salts.
+
+    Raises:
+        InputError: a length that is not positive.
+    """
+    if not 0.0 < seconds <= 3600.0:
+        raise InputError(f"seconds must be above 0 to 3600, got {seconds!r}")
+    count = round(seconds / PERIOD)
+    out = Run.empty(count, slave.model.n)
+    rng = np.random.default_rng(seed)
+    key = rng.bytes(32)
+    boxes = {
+        "master": Sealer(key, "master", 1, 3, salt=rng.bytes(8)),
+        "slave": Sealer(key, "slave", 1, 3, salt=rng.bytes(8)),
+    }
+    there, back = (FaultyLine(faults or Faults(), seed + k) for k in range(2))
+    sent = [0, 0]
+    start = slave.x.copy()
+    reason, heard = "", False
+    picked: float | None = None
+    picked_at = 0.0
+    for k in range(count):
+        time, now = k * PERIOD, k * 1_000_000
+        there.cut = back.cut = any(c.at <= time < c.at + c.seconds for c in cuts)
+        for packet in back.receive(now):
+            if (answer := boxes["master"].open(packet, now)) is not None:
+                master_side.receive(answer)
+        x, v = device.read()
+        command = master_side.step(x, v, PERIOD, now, hand=-out.force[k - 1] if k else None, closed=closed(time))
+        packet = boxes["master"].seal(master_side.message(), now)
+        sent[0] += len(packet) + 28
+        there.send(packet, now)
+
+        if (mass := slave.advance(time)) is not None:
+            picked, picked_at = mass, time
+        seen = slave.read()
+        for packet in there.receive(now):
+            if (told := boxes["slave"].open(packet, now)) is not None:
+                slave_side.receive(told)
+        # noise is no work: the reference pays for what is felt
+        port = felt_force(seen.force, seen.std, slave_side.threshold)
+        reference = slave_side.step(
+            seen.x, seen.v, seen.force, seen.std, PERIOD, now, port=port, allowed=seen.usable
+        )
+        slave.follow(reference.position, reference.velocity, reference.force)
+        packet = boxes["slave"].seal(slave_side.message(), now)
+        sent[1] += len(packet) + 28
+        back.send(packet, now)
+        if weigh and picked and time >= picked_at + 0.5:
+            # at rest what is felt is the weight; from then on it is known, and the hand is spared it
+            lately = out.estimated[k - 200 : k, 2]
+            found, std = float(-lately.mean() / 9.81), float(out.std[k - 1, 2] / 9.81)
+            out.held.append((time, picked, found, std))
+            slave.hold(max(0.0, found))
+            picked = None
+        elif weigh and picked == 0.0:
+            slave.hold(0.0)
+            picked = None
+
+        out.device[k], out.device_velocity[k] = x, v
+        out.force[k], out.felt[k] = command.force, command.felt
+        out.tip[k], out.tip_velocity[k], out.reference[k] = seen.x, seen.v, reference.position
+        out.estimated[k], out.std[k] = seen.force, seen.std
+        out.true[k] = slave.true_force()
+        out.master_events[k], out.slave_events[k] = command.events, reference.events
+        out.q[k], out.effort[k] = seen.q, slave.driver.plant.torque
+        out.levels[k] = master_side.tank()["level"], slave_side.tank()["level"]
+        now_reason = seen.reason or ("end of the slave's workspace" if reference.events & Event.WORKSPACE else "")
+        silent = bool((command.events | reference.events) & Event.LINK)
+        heard = heard or not silent
+        now_reason = "the link is dead: both hold" if heard and silent else now_reason
+        if now_reason != reason:
+            reason = now_reason
+            if reason:
+                out.reasons.append((time, reason))
+        device.step(command.force, PERIOD)
+        if k % 200 == 199:
+            if progress is not None:
+                progress(time + PERIOD, seconds)
+            if stop():
+                count = k + 1
+                break
+    for name in out.__dataclass_fields__:
+        value = getattr(out, name)
+        if isinstance(value, np.ndarray):
+            setattr(out, name, value[:count])
+    out.wanted = start + motion_scale * (out.device - out.device[0])
+    out.offset, out.round_trip = boxes["master"].clock.offset, boxes["master"].clock.round_trip
+    span = max(PERIOD, count * PERIOD)
+    out.bandwidth = (8.0 * sent[0] / span, 8.0 * sent[1] / span)
+    refused = boxes["master"].refused + boxes["slave"].refused
+    out.refused = {kind: n for kind, n in refused.items() if kind != "greeting"}
+    out.tanks = {"master": master_side.tank(), "slave": slave_side.tank()}
+    return out

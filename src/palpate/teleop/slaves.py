@@ -1,0 +1,292 @@
+"""Slaves: an arm behind the driver contract that follows a reference and tells what touches it, without a force sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._core import MomentumObserver, Status, WrenchEstimator
+from ..arm import Arm, Array
+from ..drivers.mujoco import MujocoDriver
+from ..errors import DriverError, InputError
+from ..pipeline import HeldLoad, Pipeline, Touch
+from ..simulate import Load, Plant, SensorModel
+
+if TYPE_CHECKING:
+    from .scenes import Scene
+
+RATE = 1000.0
+"""control steps per second [Hz]"""
+BANDWIDTH = 80.0
+"""of the position control [rad/s]"""
+OBSERVER = 180.0
+"""bandwidth of the momentum observer [rad/s]: what touches is known 6 ms later"""
+_SINGULAR = 0.08
+"""least singular value of the Jacobian's translation below which the arm slows down [m]"""
+STIFFENING = 40.0
+"""bandwidth with which the external torque is taken off [rad/s]: well below the observer's, which is half a period late"""
+_JERKY = 20.0
+"""acceleration of a joint's reference at most [rad/s^2]"""
+_SETTLE = 0.4
+"""at the start, over which what is felt at rest is taken for the model's error [s]"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What is known of a slave after a sample.
+
+    Attributes:
+        time_ns: of the sample.
+        q, dq: (n,) [rad, rad/s].
+        x, v: (3,) of the tool's tip, base frame [m, m/s].
+        force, std: (3,) of the environment on the tool as estimated, base axes [N].
+        reason: why it holds or slows down, empty: it does not.
+        usable: it may be moved.
+    """
+
+    time_ns: int
+    q: Array
+    dq: Array
+    x: Array
+    v: Array
+    force: Array
+    std: Array
+    reason: str
+    usable: bool
+
+
+class ArmSlave:
+    """Follows a reference of its tool's tip, keeping the tool's orientation, and estimates what touches it.
+
+    Resolved rates with damping near singular poses give joint references; each joint follows by computed torque, and the estimated external
+    torque is taken off (a disturbance observer), so that what touches the tool does not push it away from its reference::
+
+        u = M(q) (q_r'' + w^2 (q_r - q) + 2 w (q_r' - q')) + C q' + g + tau_f - tau_ext
+
+    The force told is that of the pipeline: weight and inertia of what is held are taken away, and so is what is felt at rest before the start.
+
+    Args:
+        driver: the arm; connected and enabled here.
+        model: the arm as it is known; None: the driver's plant is known exactly.
+        held: mass in the hand that is known [kg]; NaN: none is.
+    """
+
+    def __init__(self, driver: MujocoDriver, *, model: Arm | None = None, held: float = 0.0) -> None:
+        self.driver = driver
+        self.model = driver.plant.arm if model is None else model
+        arm = self.model
+        self._core = arm.core
+        self._pipeline = self._made(held)
+        self._period = driver.period_ns * 1e-9
+        low = np.array([j.limits.lower for j in arm.joints])
+        high = np.array([j.limits.upper for j in arm.joints])
+        self._low, self._high = low + 0.02, high - 0.02
+        self._fastest = np.array([j.limits.velocity for j in arm.joints])
+        self._effort = np.array([j.limits.effort for j in arm.joints])
+        self._tare: Array | None = None
+        self._rest: list[Array] = []
+        self._steps = 0
+        self._lost = 0
+        self.driver.connect()
+        self.driver.enable()
+        sample = self.driver.read()
+        assert sample is not None
+        self._touch = self._pipeline.step(sample)
+        self._q_ref = np.array(sample.position)
+        self._home = self._q_ref.copy()
+        self._dq_ref = np.zeros(arm.n)
+        self._taken_off = np.zeros(arm.n)
+        self._R0 = self._pose(self._q_ref)[0]
+        self._sample = sample
+        self._reason = ""
+        self.seen = self._see()
+
+    def _made(self, held: float) -> Pipeline:
+        return Pipeline(
+            self.model,
+            observer=MomentumObserver(bandwidth=OBSERVER),
+            payload=None,
+            wrench=WrenchEstimator(moment_prior_std=3.0),
+            load=HeldLoad(mass=held),
+        )
+
+    def hold(self, mass: float) -> None:
+        """From now on this mass in the hand is known [kg]: its weight and inertia are not felt. The estimate starts anew."""
+        self._pipeline = self._made(mass)
+        self._touch = self._pipeline.step(self._sample)
+
+    def _pose(self, q: Array) -> tuple[Array, Array, Array]:
+        """R_base_tip, place of the tool's tip, (6, n) Jacobian there."""
+        T = self.model.forward_kinematics(q)
+        J = self.model.jacobian(q)
+        tip = T[:3, :3] @ self.model.grasp + T[:3, 3]
+        return T[:3, :3], tip, J
+
+    @property
+    def x(self) -> Array:
+        """(3,) of the tool's tip [m]."""
+        return self.seen.x
+
+    def _see(self) -> Seen:
+        touch, q = self._touch, np.asarray(self._sample.position)
+        dq = np.asarray(touch.dq)
+        _, tip, J = self._pose(q)
+        wrench = touch.wrench
+        assert wrench is not None
+        good = wrench.status in (Status.ok, Status.saturated, Status.singular) and bool(np.isfinite(wrench.force).all())
+        force, std = (np.array(wrench.force), np.array(wrench.force_std)) if good else (np.zeros(3), np.full(3, np.inf))
+        if self._tare is None:
+            if good:
+                self._rest.append(force)
+            if self._steps >= _SETTLE * RATE and self._rest:
+                self._tare = np.mean(self._rest[len(self._rest) // 2 :], axis=0)
+            force = np.zeros(3)
+        else:
+            force = force - self._tare if good else force
+        usable = self._tare is not None and self._lost == 0
+        return Seen(self._sample.time_ns, q, dq, tip, J[:3] @ dq, force, std, self._reason, usable)
+
+    def read(self) -> Seen:
+        """The next period's sample. A lost one holds the last; a device that is gone stops the arm, and says so.
+
+        Never raises for a device that is gone: the state is held and ``reason`` tells.
+        """
+        self._steps += 1
+        try:
+            sample = self.driver.read()
+        except DriverError as error:
+            self._lost += 1
+            self._reason = f"device: {error}"
+            self.seen = self._see()
+            return self.seen
+        self._lost = 0 if sample is not None else self._lost + 1
+        if sample is not None:
+            self._sample = sample
+            self._touch = self._pipeline.step(sample)
+        else:
+            self._reason = "device: a sample was lost"
+        self.seen = self._see()
+        return self.seen
+
+    def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:
+        """Send the torque that takes the tool's tip to `x_ref` (3,) [m] at `v_ref` (3,) [m/s]; `push` (3,) [N] beside it.
+
+        Returns:
+            (n,) torque sent [N m]; zeros if the drives are off.
+        """
+        n, h = self.model.n, self._period
+        R, tip, J = self._pose(self._q_ref)
+        turn = self._R0 @ R.T
+        angle = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        task = np.concatenate((v_ref + 100.0 * (x_ref - tip), 50.0 * angle))
+        U, s, Vt = np.linalg.svd(J, full_matrices=True)
+        damp = 0.0 if s[-1] >= _SINGULAR else 0.02 * (1.0 - (s[-1] / _SINGULAR) ** 2)
+        self._reason = "" if s[-1] >= _SINGULAR else f"slave near a singular pose (least singular value {s[-1]:.3f})"
+        rates = Vt[: len(s)].T @ (s / (s * s + damp) * (U.T @ task))
+        if n > 6:
+            spare = Vt[6:]
+            rates = rates + spare.T @ (spare @ (1.0 * (self._home - self._q_ref)))
+        over = float(np.max(np.abs(rates) / self._fastest))
+        if over > 1.0:
+            rates, self._reason = rates / over, "a joint of the slave at its largest speed"
+        wanted = self._q_ref + h * rates
+        inside = np.clip(wanted, self._low, self._high)
+        if np.any(inside != wanted):
+            self._reason = "a joint of the slave at its limit: the master points out of its reach"
+        # a reference that jerks would be taken for a touch: torque and differentiated velocity are half a period apart
+        ddq_ref = np.clip(((inside - self._q_ref) / h - self._dq_ref) / h, -_JERKY, _JERKY)
+        rates = self._dq_ref + h * ddq_ref
+        self._q_ref, self._dq_ref = np.clip(self._q_ref + h * rates, self._low, self._high), rates
+
+        seen, external = self.seen, self._touch.external
+        a = ddq_ref + BANDWIDTH**2 * (self._q_ref - seen.q) + 2.0 * BANDWIDTH * (rates - seen.dq)
+        torque = self.model.inverse_dynamics(seen.q, seen.dq, a) + self.model.friction_torque(seen.dq)
+        if external.status == Status.ok:
+            self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (external.torque - self._taken_off)
+        torque = torque - self._taken_off
+        if push is not None:
+            torque = torque + J[:3].T @ push
+        if self.driver.state != "enabled":
+            return np.zeros(n)
+        return self.driver.write(np.clip(torque, -self._effort, self._effort))
+
+    def touch(self) -> Touch:
+        """Everything the pipeline knows after the newest sample."""
+        return self._touch
+
+    def close(self) -> None:
+        """Stop the drives and let go."""
+        self.driver.close()
+
+
+class SimulatedSlave(ArmSlave):
+    """An :class:`ArmSlave` in MuJoCo, in a scene, with the truth beside it.
+
+    Args:
+        arm: as it is, with its tool; see :func:`palpate.teleop.scenes.slave_arm`.
+        q: (n,) pose at the start [rad].
+        scene: what there is to touch; None: nothing.
+        model: as it is known; None: exactly.
+        seed: of the sensors' noise.
+
+    Raises:
+        InputError: the pose does not fit.
+        MissingExtraError: mujoco is not installed.
+    """
+
+    def __init__(self, arm: Arm, q: Array, scene: Scene | None = None, *, model: Arm | None = None, seed: int = 0) -> None:
+        if np.shape(q) != (arm.n,):
+            raise InputError(f"q: expected {arm.n} angles, got {np.shape(q)}")
+        build = None if scene is None else scene.build
+        plant = Plant(arm, contacts=build is not None, scene=build, timestep=2.5e-4, integrator="discrete")
+        driver = MujocoDriver(plant, sensor=SensorModel(arm, rate=RATE, seed=seed), q=q)
+        super().__init__(driver, model=model)
+        self._masses = list(() if scene is None else scene.masses)
+        self._contact = np.zeros(6)
+
+    @property
+    def plant(self) -> Plant:
+        """The truth."""
+        return self.driver.plant
+
+    def advance(self, time: float) -> float | None:
+        """Take and put down what the scene says happens by a time [s]; the mass now held [kg] if it changed."""
+        changed = None
+        while self._masses and self._masses[0][0] <= time:
+            _, mass = self._masses.pop(0)
+            if mass > 0.0:
+                self.plant.attach(Load(mass))
+            else:
+                self.plant.release()
+            changed = mass
+        return changed
+
+    def true_force(self) -> Array:
+        """(3,) of the scene on the arm, base axes, from MuJoCo's contacts [N]."""
+        from ..simulate._model import mujoco
+
+        plant = self.plant
+        mj, model, data = mujoco(), plant.model, plant.data
+        total = np.zeros(3)
+        for k in range(data.ncon):
+            contact = data.contact[k]
+            mj.mj_contactForce(model, data, k, self._contact)
+            force = contact.frame.reshape(3, 3).T @ self._contact[:3]
+            # along the normal from the first geom to the second: on the second
+            own = _of_arm(model, contact.geom2)
+            total += force if own else -force
+        return total
+
+
+def _of_arm(model: Any, geom: int) -> bool:
+    name = model.body(model.geom_bodyid[geom]).name
+    return bool(name.startswith("arm:"))
+
+
+def reach(arm: Arm) -> float:
+    """How far the tool's tip can be from the base, at most [m]."""
+    lengths = [float(np.linalg.norm(j.T_parent_joint[:3, 3])) for j in arm.joints]
+    return math.fsum(lengths) + float(np.linalg.norm(arm.T_last_tip[:3, 3])) + float(np.linalg.norm(arm.grasp))
