@@ -315,6 +315,41 @@ TEST(Contact, ASlowPushAtRestIsFoundOnceItOutdoesStiction) {
   }
 }
 
+TEST(Contact, NoiseOfTheVelocityHidesNoPushWhereFrictionRemembers) {  // its sign goes with the travel
+  ArmDescription d = description(2);
+  for (auto& joint : d.joints) {
+    joint.velocity_std = 2e-3;
+    joint.friction.sign_velocity = 1e-3;
+    joint.friction.presliding = 1e-4;
+  }
+  const Arm arm(d);
+  ContactDetector detector(arm);
+  FrictionMemory memory;
+  const LoadTorque load(arm);
+  Random noise(7);
+  Contact seen;
+  for (int k = 0; k < 1650; ++k) {  // until the push outdoes stiction, 2.6 N m, 2.5 times
+    JointSample s;
+    s.time_ns = k * 1000000ll;
+    s.dt = k > 0 ? 1e-3 : 0.0;
+    s.velocity_measured = true;
+    s.status = Status::ok;
+    const double push = 10.0 * std::max(0.0, 1e-3 * (k - 1000));
+    const auto m = momentum_terms<double>(arm, s.q, JointVector{});
+    for (int j = 0; j < 2; ++j) {
+      s.dq_std[at(j)] = 2e-3;
+      s.dq[at(j)] = 2e-3 * noise.normal();
+      s.tau[at(j)] = m.g[at(j)] - (j == 0 ? push : 0.0) + 0.1 * noise.normal();
+    }
+    memory.step(arm, s);
+    seen = detector.step(s, load);
+    if (push <= 2.6) ASSERT_EQ(seen.count, 0u) << k;
+  }
+  EXPECT_TRUE(seen.active);
+  EXPECT_EQ(seen.link, 0);
+  EXPECT_NEAR(static_cast<double>(seen.onset_time_ns) * 1e-9, 1.0, 0.15);
+}
+
 TEST(Contact, ALoadThatIsKnownIsNone) {
   ArmDescription d = description(4);
   const Arm arm(d);

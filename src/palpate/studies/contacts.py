@@ -115,6 +115,7 @@ def real_rows(folder: Path, arm: Arm, detector: ContactDetector) -> list[Row]:
     away = [abs(h[0] - t) for t, h in zip(truth, near, strict=True) if h in met and h is not None]
     extra = [h for h in hits if all(h[1] is not m[1] for m in met)]
     second = sum(e.link == 1 for _, e in met)
+    felt = [f"{e.torque[1] / e.std[1]:.1f}" for _, e in met if e.link == 0]
     allowed = sum(e.link <= 1 <= e.farthest for _, e in met)
     rows = [
         _all("UR10e, hits on link 2: found", len(truth), len(met), f"labels within {2.0 * ONSET:g} s"),
@@ -123,7 +124,7 @@ def real_rows(folder: Path, arm: Arm, detector: ContactDetector) -> list[Row]:
             len(truth),
             second,
             f"of {len(met)} found; {allowed} say link 2 or beyond is possible; pushed along the axis of joint 2, only "
-            "joint 1 feels it",
+            f"joint 1 feels it: in those named link 1 joint 2 bears {', '.join(felt)} standard deviations",
         ),
         at_most("UR10e, hits: onset off the label, worst", ONSET, max(away, default=math.inf), "s"),
         at_most(
@@ -146,8 +147,7 @@ def real_rows(folder: Path, arm: Arm, detector: ContactDetector) -> list[Row]:
             ONSET,
             max(late, default=math.inf),
             "s",
-            ", ".join(f"{x:+.2f}" for x in late)
-            + " s; begins are read off to 0.1 s, stiction hides the first newtons",
+            ", ".join(f"{x:+.2f}" for x in late) + " s; begins are read off to 0.1 s",
         )
     )
     for name in (*FREE, *UNSEEN):
