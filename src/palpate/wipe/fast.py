@@ -27,7 +27,7 @@ TORQUE_STD = 0.02
 """of a joint torque sensor [N m]"""
 STALE = 3
 """cycles of control without a command after which the robot holds by itself"""
-STIFF = (900.0, 60.0)
+STIFF = (2500.0, 100.0)
 """of an arm that holds or moves, per inertia [1/s^2], [1/s]"""
 
 

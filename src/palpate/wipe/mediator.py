@@ -34,8 +34,10 @@ MOVED = 0.008
 """a board that is seen so far from where it was has moved [m]"""
 SLIPPED = 0.002
 """the hand that holds the board has moved by so much [m]"""
-PATCH, SEARCH = 16, 40
+PATCH, SEARCH = 16, 100
 """half sides of what a corner looks like, and of where it is sought [pixel]"""
+SAME = 12.0
+"""two corners that went the same way are so far apart in that at most [pixel]"""
 LIKE = 0.75
 """correlation from which a corner is found"""
 SHAPE = 8.0
@@ -159,16 +161,17 @@ def displacement(reference: Look, now: Look) -> float | None:
     for corner in board.corners:
         u, v = np.rint(corner).astype(int)
         a, b = PATCH, PATCH + SEARCH
-        if not (b <= u < width - b and b <= v < height - b):
+        if not (a <= u < width - a and a <= v < height - a):
             continue
         patch = first[v - a : v + a + 1, u - a : u + a + 1]
-        found = cv2.matchTemplate(second[v - b : v + b + 1, u - b : u + b + 1], patch, cv2.TM_CCOEFF_NORMED)
+        left, top = max(0, u - b), max(0, v - b)
+        found = cv2.matchTemplate(second[top : v + b + 1, left : u + b + 1], patch, cv2.TM_CCOEFF_NORMED)
         _, best, _, at = cv2.minMaxLoc(found)
         if best > LIKE:
-            shift = np.array(at, dtype=np.float64) - SEARCH
+            shift = np.array(at, dtype=np.float64) + [left - u + a, top - v + a]
             ways.append((shift, np.linalg.norm(plane.to_board(corner + shift) - plane.to_board(corner))))
     for (p, far), (q, other) in itertools.combinations(ways, 2):
-        if float(np.linalg.norm(p - q)) < 0.3 * SEARCH:
+        if float(np.linalg.norm(p - q)) < SAME:
             return float(min(far, other))
     return None
 
