@@ -36,8 +36,8 @@ SLIPPED = 0.002
 """the hand that holds the board has moved by so much [m]"""
 PATCH, SEARCH = 16, 100
 """half sides of what a corner looks like, and of where it is sought [pixel]"""
-SAME = 12.0
-"""two corners that went the same way are so far apart in that at most [pixel]"""
+SAME = 0.012
+"""two corners that went the same way differ in it by so much at most [m]"""
 LIKE = 0.75
 """correlation from which a corner is found"""
 SHAPE = 8.0
@@ -169,10 +169,10 @@ def displacement(reference: Look, now: Look) -> float | None:
         _, best, _, at = cv2.minMaxLoc(found)
         if best > LIKE:
             shift = np.array(at, dtype=np.float64) + [left - u + a, top - v + a]
-            ways.append((shift, np.linalg.norm(plane.to_board(corner + shift) - plane.to_board(corner))))
-    for (p, far), (q, other) in itertools.combinations(ways, 2):
+            ways.append(plane.to_board(corner + shift) - plane.to_board(corner))
+    for p, q in itertools.combinations(ways, 2):
         if float(np.linalg.norm(p - q)) < SAME:
-            return float(min(far, other))
+            return float(min(np.linalg.norm(p), np.linalg.norm(q)))
     return None
 
 
