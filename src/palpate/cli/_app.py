@@ -23,14 +23,15 @@ from . import (
     teleop,
     view,
     weigh,
+    wipe,
 )
 
 app = typer.Typer(
     name="palpate",
     help="A sense of touch for robot arms without a force sensor.\n\n"
     "Start with palpate weigh: a simulated arm lifts something and tells what it weighs.",
-    epilog="Every command has --help with examples. Exit codes: 0 done, 1 a row of a study misses or a replay differs, "
-    "2 wrong input, 70 a bug in palpate, 130 stopped by Ctrl-C.",
+    epilog="Every command has --help with examples. Exit codes: 0 done, 1 a row of a study misses, a replay "
+    "differs or ink is left, 2 wrong input, 70 a bug in palpate, 130 stopped by Ctrl-C.",
     add_completion=False,
     invoke_without_command=True,
     rich_markup_mode=None,
@@ -62,6 +63,7 @@ def _start(
 
 for module in (
     weigh,
+    wipe,
     feel,
     view,
     simulate,

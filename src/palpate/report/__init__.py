@@ -18,12 +18,14 @@ from .identify import write_identify_report
 from .study import StudyFiles, StudyRow, markdown_table, update_markdown, write_study
 from .weigh import write_weigh_report
 from .weighing import WeighReport
+from .wipe import WipeReport, write_wipe_report
 
 __all__ = [
     "FeelReport",
     "StudyFiles",
     "StudyRow",
     "WeighReport",
+    "WipeReport",
     "coverage_figure",
     "encode_png",
     "error_figure",
@@ -39,4 +41,5 @@ __all__ = [
     "write_identify_report",
     "write_study",
     "write_weigh_report",
+    "write_wipe_report",
 ]

@@ -224,5 +224,6 @@ def decode_png(picture: bytes) -> npt.NDArray[np.uint8]:
 
 
 def data_url(picture: bytes) -> str:
-    """A PNG as the text of an image's address."""
-    return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
+    """A PNG or a JPEG as the text of an image's address."""
+    kind = "jpeg" if picture.startswith(b"\xff\xd8") else "png"
+    return f"data:image/{kind};base64," + base64.b64encode(picture).decode("ascii")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from ..arm import Array
 from ._image import Float, Image, Index, Mask
@@ -30,6 +32,30 @@ BOW = 0.4
 MOST = 0.6
 """part of the pieces in which an edge must be seen"""
 
+STRETCHES, EACH = 15, 12
+"""for the border a side is looked at in so many stretches, of so many samples"""
+PITCH = 0.75
+"""in rows so far apart [pixels]"""
+BEYOND, WITHIN = 9.0, 0.075
+"""so far outward [pixels] and inward, relative to the board, of the edge known"""
+SHEARS = np.arange(-6.0, 7.0, 3.0)
+"""from one end of a side to the other the border may lean by this against the edge known [pixels]"""
+STRAIGHT = len(SHEARS) // 2
+APART = 3
+"""rows from an edge to what is beside it"""
+FAINTEST, SIGMAS, RELATIVE = 2.5, 4.5, 0.035
+"""steepness of an edge over two rows [grey levels], relative to the noise and to the steepest edge"""
+AGREE = 0.75
+"""part of the stretches that show it"""
+SOFT, WIDEST = 1.6, 5.0
+"""the flank of a shadow is so many times as wide as an edge beside it, and wider than blur makes an edge [pixels]"""
+KINK, ENDS, SHARE = 2, 8, 0.25
+"""rows over which a bend is seen; rows inward in which an edge ends; relative to the strongest bend there"""
+BLUR = 1.3
+"""from the middle of an edge to its bend [pixels]"""
+SAME = 0.8
+"""edges so near to each other are the same [pixels]"""
+
 
 @dataclass(frozen=True, slots=True)
 class Edges:
@@ -51,7 +77,10 @@ def fit(image: Image, corners: Array, border: Mask) -> Edges:
         corners: (4, 2) rough, clockwise.
         border: (4,) bool: this side is the picture's border and stays.
     """
-    return _fitted(image, _inner(image, corners, border), border, 3.5)
+    inner = _inner(image, corners, border)
+    sides = [_Side(inner[k], inner[(k + 1) % 4], 0.0, 1.0, 0.0) for k in range(4)]
+    sides = _border(image, _fitted(image, sides, border, 3.5), border)
+    return Edges(_corners(sides), np.array([s.seen for s in sides]), np.array([s.spread for s in sides]))
 
 
 def _sampled(image: Image, points: Array) -> Float:
@@ -113,15 +142,12 @@ def _steps(image: Image, around: Array, slants: Array) -> list[_Steps]:
         around: (S, 4, 2) corners; the side is the one from the first to the second.
         slants: (S, 2) where rows begin and end, relative to the side, as ``begin`` and ``end`` of the result.
     """
-    u = np.linspace(0.04, 0.96, ALONG)
     v = np.linspace(-OUTWARD, INWARD, ROWS + 2)
     strips = len(around)
-    grid = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
-    points = np.empty((strips, ROWS + 2, ALONG, 2))
+    level = np.empty((strips, ROWS + 2, ALONG, 3), np.float32)
     for k, H in enumerate(homographies(around)):
-        lean = slants[k, 0] + (slants[k, 1] - slants[k, 0]) * grid[:, :1]
-        points[k] = mapped(H[None], grid + lean * np.array([0.0, 1.0])).reshape(ROWS + 2, ALONG, 2)
-    level = np.stack([cv2.blur(_sampled(image, p), (1, 3)) for p in points])
+        strip = _strip(image, H, (0.04, 0.96), (v[0], v[-1]), (ALONG, ROWS + 2), slants[k])
+        level[k] = cv2.blur(strip.astype(np.float32), (1, 3))
     step = level[:, 2:] - level[:, :-2]
     # per piece the median over its columns: a stroke or a magnet covers few of them
     pieces = np.sort(step.reshape(strips, ROWS, PIECES, -1, 3), 3)[:, :, :, ALONG // PIECES // 2]
@@ -208,47 +234,227 @@ def _innermost(steps: _Steps, opposite: _Steps | None) -> int | None:
     return None
 
 
-def _fitted(image: Image, corners: Array, border: Mask, reach: float) -> Edges:
-    """Curves through the step nearest to each side, within `reach` pixels, and where they meet."""
-    sides: list[tuple[Array, Array, Array]] = []
-    seen, spread = np.ones(4), np.zeros(4)
-    for side in range(4):
-        p, q = corners[side], corners[(side + 1) % 4]
-        inward = _normal(p, q)
-        found = None if border[side] else _side(image, p, q, inward, reach)
-        curve = np.zeros(3)
-        if found is not None:
-            curve, seen[side], spread[side] = found
-        elif not border[side]:
-            seen[side] = 0.0
-        # the point at t is x + t (y - x) + t^2 z
-        sides.append((p + curve[0] * inward, q + (curve[0] + curve[1]) * inward, curve[2] * inward))
-    return Edges(np.array([_corner(sides[k - 1], sides[k]) for k in range(4)]), seen, spread)
+@dataclass(frozen=True, slots=True)
+class _Side:
+    """A side as a curve: the point at t is p + t (q - p) + bow (t^2 - t) n, n pointing inward."""
+
+    p: Array
+    q: Array
+    bow: float
+    seen: float
+    """part of it where its edge was found"""
+    spread: float
+    """deviation of the edge points from it [pixels]"""
+
+    @property
+    def inward(self) -> Array:
+        return _normal(self.p, self.q)
+
+    def moved(self, begin: float, end: float, bow: float, seen: float, spread: float) -> _Side:
+        """Inward by so many pixels at its ends."""
+        n = self.inward
+        return _Side(self.p + begin * n, self.q + end * n, bow, seen, spread)
 
 
-def _corner(before: tuple[Array, Array, Array], after: tuple[Array, Array, Array]) -> Array:
+def _fitted(image: Image, sides: list[_Side], border: Mask, reach: float) -> list[_Side]:
+    """Curves through the step nearest to each side, within `reach` pixels."""
+    return [
+        side if border[k] else (_nearest(image, side, reach) or replace(side, seen=0.0, spread=0.0))
+        for k, side in enumerate(sides)
+    ]
+
+
+def _corners(sides: list[_Side]) -> Array:
+    """(4, 2): corner k where sides k-1 and k meet."""
+    return np.array([_corner(sides[k - 1], sides[k]) for k in range(4)])
+
+
+def _corner(before: _Side, after: _Side) -> Array:
     """Where the end of one side meets the begin of the next."""
+    (x, y, z), (u, v, w) = ((s.p, s.q - s.p - s.bow * s.inward, s.bow * s.inward) for s in (before, after))
     t = np.array([1.0, 0.0])
     for _ in range(4):  # Newton; straight sides need one step
-        (x, y, z), (u, v, w) = before, after
-        here = x + t[0] * (y - x) + t[0] ** 2 * z
-        there = u + t[1] * (v - u) + t[1] ** 2 * w
-        slope = np.stack([y - x + 2.0 * t[0] * z, u - v - 2.0 * t[1] * w], 1)
+        here = x + t[0] * (y + t[0] * z)
+        there = u + t[1] * (v + t[1] * w)
+        slope = np.stack([y + 2.0 * t[0] * z, -v - 2.0 * t[1] * w], 1)
         t = t - np.linalg.solve(slope, here - there)
-    u, v, w = after
-    return u + t[1] * (v - u) + t[1] ** 2 * w
+    return u + t[1] * (v + t[1] * w)
 
 
-def _side(image: Image, p: Array, q: Array, inward: Array, reach: float) -> tuple[Array, float, float] | None:
-    """The step nearest to the line from p to q.
+def _border(image: Image, sides: list[_Side], border: Mask) -> list[_Side]:
+    """From edges that are seen to the border of the writing surface, which may be fainter than the noise of a pixel.
 
-    Returns:
-        its distance from the line at t = 0 to 1 as the coefficients (3,) of 1, t and t^2 [pixels], the part of the side
-        where it is seen, and the deviation from that curve [pixels]; None: there is none.
+    A frame has several edges, and the one towards a white surface is often the faintest. It is parallel to the edges
+    known, and averaged over a whole side the noise is small.
     """
+    corners = _corners(sides)
+    found = _parallels(image, corners, sides)
+    result = list(sides)
+    for k, steps in enumerate(found):
+        if border[k]:
+            continue
+        i = _innermost(steps, None if border[k - 2] else found[k - 2])
+        if i is None:
+            continue
+        H = homographies(np.roll(corners, -k, 0)[None])
+        p, q = mapped(H, np.array([[0.0, steps.begin[i]], [1.0, steps.end[i]]]))[0]
+        n = sides[k].inward
+        if max(abs((p - sides[k].p) @ n), abs((q - sides[k].q) @ n)) > SAME:
+            result[k] = _Side(p, q, sides[k].bow, sides[k].seen, sides[k].spread)
+    return result
+
+
+def _parallels(image: Image, corners: Array, sides: list[_Side]) -> list[_Steps]:
+    """Sharp edges along sides, faint ones too."""
+    H = homographies(np.array([np.roll(corners, -k, 0) for k in range(4)]))
+    ends = np.diff(mapped(H, np.array([[0.5, 0.0], [0.5, 0.01]])), axis=1)[:, 0]
+    extent = [100.0 * float(d @ side.inward) for d, side in zip(ends, sides, strict=True)]
+    v = np.arange(-BEYOND, max(WITHIN * max(extent), 14.0), PITCH)
+    u = (np.arange(STRETCHES) + 0.5) / STRETCHES
+    middles = mapped(H, np.stack([0.035 + 0.93 * u, np.zeros(STRETCHES)], 1))
+    each = np.empty((4, len(SHEARS), len(v) - 2, 3, STRETCHES), np.float32)
+    rows = np.arange(len(v) - 2)
+    for k, side in enumerate(sides):
+        size = (STRETCHES * EACH, len(v))
+        level = _strip(image, H[k], (0.035, 0.965), (v[0] / extent[k], v[-1] / extent[k]), size)
+        # means of medians of three far from each other: a stroke or a magnet covers few of them
+        apart = np.moveaxis(level.reshape(len(v), STRETCHES, 3, EACH // 3, 3), 2, 0)
+        profile = _between(*apart).mean(2, dtype=np.float32).swapaxes(1, 2)
+        along = side.q - side.p
+        t = (middles[k] - side.p) @ along / (along @ along)
+        shift = np.rint((SHEARS[:, None] * (u - 0.5) + side.bow * (t * t - t)) / PITCH).astype(np.int64)
+        at = np.clip(rows[None, :, None] + shift[:, None], 0, len(rows) - 1)
+        each[k] = (profile[2:] - profile[:-2])[at[:, :, None], np.arange(3)[:, None], np.arange(STRETCHES)]
+    v = v[1:-1]
+    mean = _between(*np.moveaxis(each.reshape(*each.shape[:4], 3, -1), 4, 0)).mean(4)
+    size = np.linalg.norm(mean, axis=3)
+    colour = mean / np.maximum(size, 1e-6)[..., None]
+    # a shadow and a round profile are slopes that go on: only what is steeper than both sides of it is an edge
+    beside = [(mean[:, :, np.clip(rows + d, 0, len(v) - 1)] * colour).sum(3) for d in (-APART, APART)]
+    # compression leaves false colours, hardly false brightness
+    grey = np.maximum(np.abs(colour.sum(3)) / np.sqrt(3.0), 0.5)
+    sharp = (size - np.maximum(np.maximum(*beside), 0.0)) * grey
+    agree = ((colour[..., None, :] @ each)[..., 0, :] > 0.35 * size[..., None]).mean(3)
+    found = []
+    for k in range(4):
+        inside = (v > 0.5 * WITHIN * extent[k]) & (v < WITHIN * extent[k])
+        noise = float(np.median(size[k, STRAIGHT, inside]))
+        floor = max(FAINTEST, SIGMAS * noise, RELATIVE * float(size[k].max()))
+        clear = (sharp[k] > floor) & (agree[k] >= AGREE) & (v < max(WITHIN * extent[k], 14.0))
+        found.append(_edges(v, np.where(clear, sharp[k], 0.0), mean[k], colour[k], floor, extent[k]))
+    return found
+
+
+def _between(a: npt.NDArray[Any], b: npt.NDArray[Any], c: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The middle of three, elementwise."""
+    return np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+
+
+def _strip(
+    image: Image,
+    H: Array,
+    u: tuple[float, float],
+    v: tuple[float, float],
+    size: tuple[int, int],
+    slant: Array | None = None,
+) -> Image:
+    """What lies along a side: columns from u[0] to u[1] and rows from v[0] to v[1] on the unit square of H.
+
+    `slant` is added to v at u = 0 and 1.
+    """
+    du, dv = (u[1] - u[0]) / (size[0] - 1), (v[1] - v[0]) / (size[1] - 1)
+    low, lean = (0.0, 0.0) if slant is None else (slant[0], slant[1] - slant[0])
+    place = np.array([[du, 0.0, u[0]], [lean * du, dv, v[0] + low + lean * u[0]], [0.0, 0.0, 1.0]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(image, H @ place, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _edges(v: Array, sharp: Array, mean: Array, colour: Array, floor: float, extent: float) -> _Steps:
+    """The edges of one side, as fractions of the board's extent across it.
+
+    Args:
+        v: (R,) distance of rows inward of the edge known [pixels].
+        sharp: (SHEARS, R) how clear an edge is there, 0: none.
+        mean, colour: (SHEARS, R, 3) change of the picture there over two rows, and its direction.
+        floor: least change of an edge.
+        extent: of the board across the side [pixels].
+    """
+    shear, best = sharp.argmax(0), sharp.max(0)
+    padded = np.pad(best, 3)
+    peak = (best > 0.0) & (best >= np.max([padded[i : i + len(best)] for i in range(7)], 0))
+    peaks = [int(r) for r in 1 + np.flatnonzero(peak[1:-1])]
+    # the edge known is among them as it is; what crosses it is the same edge once more
+    known, reach = int(np.abs(v).argmin()), 0.5 * np.abs(SHEARS[shear])
+    outer = [r for r in peaks if v[r] + reach[r] < -SAME]
+    inner = [r for r in peaks if v[r] - reach[r] > 0.5 * APART * PITCH]
+    shear[known] = STRAIGHT
+    peaks = [*outer, known, *inner]
+    slopes = [mean[shear[r]] @ colour[shear[r], r] for r in peaks]
+    firm = _firm(v[peaks], np.array([_width(slope, r) for slope, r in zip(slopes, peaks, strict=True)]))
+    if firm[len(outer)]:
+        firm[: len(outer)] = False
+    lean = 0.5 * SHEARS[shear[peaks]]
+    place = np.array(
+        [
+            (0.0 if r == known else v[r] + PITCH * _vertex(slope[r - 1 : r + 2]))
+            + _shoulder(np.cumsum(mean[shear[r]], 0), r, floor)
+            for slope, r in zip(slopes, peaks, strict=True)
+        ]
+    )
+    return _Steps(
+        (place - lean)[firm] / extent, (place + lean)[firm] / extent, float(best[peaks][firm].sum())
+    )
+
+
+def _firm(place: Array, width: Array) -> Mask:
+    """Which edges, from outside to inside, are none of a soft shadow that a frame throws.
+
+    Its flank is wider than the edge that throws it.
+    """
+    wider = (width[:, None] > SOFT * width) & (width[:, None] > WIDEST)
+    near = place[:, None] - place < 2.0 * width[:, None]
+    shadow = np.tril(wider & near, -1)
+    return np.array([not row.any() for row in shadow])
+
+
+def _vertex(y: Array) -> float:
+    """Where the parabola through three values has its peak, from -1 to 1."""
+    bend = y[0] - 2.0 * y[1] + y[2]
+    return float(np.clip(0.5 * (y[0] - y[2]) / bend, -1.0, 1.0)) if bend < -1e-3 else 0.0
+
+
+def _width(slope: Array, row: int) -> float:
+    """Of an edge at half its steepness [pixels]."""
+    flat = slope < 0.5 * slope[row]
+    flat[[0, -1]] = True
+    return PITCH * float(flat[row:].argmax() + flat[row::-1].argmax() - 1)
+
+
+def _shoulder(total: Array, row: int, floor: float) -> float:
+    """How far inward of its steepest row the surface begins, where that is more than blur [pixels].
+
+    An edge so near to another that blur joins them is no peak of steepness; where it ends the picture still bends.
+
+    Args:
+        total: (R, 3) sums of the changes over two rows.
+    """
+    rows = np.arange(max(row - 5, KINK), min(row + ENDS, len(total) - KINK))
+    if len(rows) < 3:
+        return 0.0
+    bend = 0.5 * np.linalg.norm(total[rows + KINK] - 2.0 * total[rows] + total[rows - KINK], axis=1)
+    high = max(SHARE * float(bend.max()), floor)
+    peak = 1 + np.flatnonzero((bend[1:-1] >= bend[:-2]) & (bend[1:-1] >= bend[2:]) & (bend[1:-1] > high))
+    end = (rows[peak[-1]] - row) * PITCH - BLUR if len(peak) else 0.0
+    return float(end) if end > BLUR else 0.0
+
+
+def _nearest(image: Image, side: _Side, reach: float) -> _Side | None:
+    """The side moved onto the step nearest to it; None: there is none."""
+    p, q, inward = side.p, side.q, side.inward
     t = np.linspace(0.04, 0.96, ALONG)
     v = np.arange(-reach - 1.5, reach + 1.6, 0.5)
-    points = (p + t[:, None] * (q - p))[None] + v[:, None, None] * inward
+    bow = side.bow * (t * t - t)
+    points = (p + t[:, None] * (q - p) + bow[:, None] * inward)[None] + v[:, None, None] * inward
     level = cv2.blur(_sampled(image, points), (3, 3))
     step = level[2:] - level[:-2]
     v = v[1:-1]
@@ -268,7 +474,9 @@ def _side(image: Image, p: Array, q: Array, inward: Array, reach: float) -> tupl
     if good.sum() < 8:
         return None
     curve, spread = _curve(t[good], place[good])
-    return curve, float(good.mean()), spread
+    return side.moved(
+        curve[0], curve[0] + curve[1] + curve[2], side.bow + curve[2], float(good.mean()), spread
+    )
 
 
 def _at(curve: Array, t: Array) -> Array:

@@ -40,7 +40,7 @@ class Lines:
 
 def find(grey: Image, count: int) -> Lines:
     """The `count` best supported lines of a grey picture."""
-    found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_NONE, 0.8, 0.6, QUANTUM).detect(grey)[0]
+    found = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, 0.8, 0.6, QUANTUM).detect(grey)[0]
     if found is None:
         return Lines(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
     ends = found.reshape(-1, 2, 2).astype(np.float64)

@@ -17,13 +17,16 @@ except ImportError:
     raise MissingExtraError("wipe", "wiping a board") from None
 
 from .choice import COLOURS, Choice, choose, ink_colours
+from .film import Film, Video
 from .ink import InkLayer, handwriting
 from .job import WipeJob
 from .options import JobOptions
 from .reach import Reach, inverse_kinematics, reachable, tool_poses
+from .record import RunRecorder
 from .result import Event, JobResult, Look, Observer, Pass, Tick, Timing, Track
 from .scene import BoardScene, Setting
 from .strokes import Eraser, Leg, Motion, Phase, Plan, plan, swept
+from .summary import report, summary
 
 __all__ = [
     "COLOURS",
@@ -31,6 +34,7 @@ __all__ = [
     "Choice",
     "Eraser",
     "Event",
+    "Film",
     "InkLayer",
     "JobOptions",
     "JobResult",
@@ -42,10 +46,12 @@ __all__ = [
     "Phase",
     "Plan",
     "Reach",
+    "RunRecorder",
     "Setting",
     "Tick",
     "Timing",
     "Track",
+    "Video",
     "WipeJob",
     "choose",
     "handwriting",
@@ -53,6 +59,8 @@ __all__ = [
     "inverse_kinematics",
     "plan",
     "reachable",
+    "report",
+    "summary",
     "swept",
     "tool_poses",
 ]

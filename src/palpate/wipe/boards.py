@@ -24,12 +24,18 @@ def random_board(seed: int) -> tuple[InkLayer, Setting]:
         layer, int(rng.integers(1 << 30)), lines=int(rng.integers(2, 5)), smudges=int(rng.integers(1, 3))
     )
     tilt = float(rng.uniform(-TILT, TILT))
-    x = 0.60 + 0.15 * tilt + float(rng.uniform(-0.01, 0.01))
+    x, _, z = place(tilt)
+    x += float(rng.uniform(-0.01, 0.01))
     return layer, Setting(
-        centre=(x, float(rng.uniform(-0.03, 0.03)), 0.15),
+        centre=(x, float(rng.uniform(-0.03, 0.03)), z),
         turn=float(rng.uniform(-0.1, 0.1)),
         tilt=tilt,
         mass=float(rng.uniform(1.2, 2.0)),
         friction=float(rng.uniform(0.35, 0.5)),
         seed=seed,
     )
+
+
+def place(tilt: float) -> tuple[float, float, float]:
+    """Where on a table of this tilt [rad] an LBR iiwa 7 gets everywhere on a board: its middle, world [m]."""
+    return 0.60 + 0.15 * tilt, 0.0, 0.15

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -27,7 +27,7 @@ TORQUE_STD = 0.02
 """of a joint torque sensor [N m]"""
 STALE = 3
 """cycles of control without a command after which the robot holds by itself"""
-STIFF = (900.0, 60.0)
+STIFF = (2500.0, 100.0)
 """of an arm that holds or moves, per inertia [1/s^2], [1/s]"""
 
 
@@ -89,7 +89,7 @@ class Robot(Activity):
         self.sent: tuple[Array, Array] = tuple(np.zeros(a.n) for a in scene.arms)  # type: ignore[assignment]
         self.orphaned = False
         """there is no fresh command"""
-        self._limiters = tuple(SafetyLimiter(a) for a in scene.arms)
+        self._limiters = tuple(SafetyLimiter(a, damping=_braking(a, period_ns * 1e-9)) for a in scene.arms)
         self._rng = np.random.default_rng(seed)
         self.reading: Reading | None = None
         self._before: Reading | None = None
@@ -146,6 +146,15 @@ class Robot(Activity):
         )
         self._before = self._before or self.reading
         self.readings.append(self.reading)
+
+
+def _braking(arm: Arm, h: float) -> Array:
+    """(n,) damping of the limiter [N m s/rad] that does not rattle at steps of `h` [s], however light the joint."""
+    limits = [j.limits for j in arm.joints]
+    usual = np.array([x.effort / x.velocity for x in limits])
+    poses = np.random.default_rng(0).uniform(-2.0, 2.0, (100, arm.n))
+    inertia = np.diagonal(arm.mass_matrix(poses), axis1=1, axis2=2).min(0)
+    return np.minimum(usual, 0.7 * inertia / h)
 
 
 class Estimation(Activity):
@@ -274,6 +283,8 @@ class Wipe:
     """longest time until something is felt [s]"""
     LOST = 0.4
     """longest time without contact while sliding [s]"""
+    AWAY = 0.12
+    """pushed further away, it comes back by its joints [m]"""
     DEEP = 0.02
     """so far below the board's surface no eraser gets [m]"""
 
@@ -312,18 +323,21 @@ class Wipe:
             return self._drive(hold, -1, felt, q, dq, done=True)
         leg, stroke = self._legs[0]
         effect = self._drive(leg, stroke, felt, q, dq)
+        if effect.fault:
+            return effect
         if effect.yielding:
             self._disturbed = True
             return effect
         if self._disturbed:
             self._disturbed = False
+            away = float(np.linalg.norm(at - leg.at(self._t)[0]))
+            if away > self.AWAY:
+                return replace(effect, fault=f"the arm was pushed away by {1e2 * away:.0f} cm")
             self._rejoin(at)
             return effect
         normal = float(felt.wrench[:3] @ self._axes[:, 2])
         fault = self._progress(leg, at, normal, h, rate)
-        return Effect(
-            effect.tau, not self._legs, fault, effect.commanded, effect.wanted_force, effect.phase, stroke
-        )
+        return replace(effect, done=not self._legs, fault=fault)
 
     def _drive(self, leg: Leg, stroke: int, felt: Felt, q: Array, dq: Array, *, done: bool = False) -> Effect:
         x, v = leg.at(self._t)
@@ -430,7 +444,7 @@ class Control(Activity):
         period_ns: int,
         felt: Slot[Felt],
         command: Slot[Torques],
-        fault: Callable[[int, str], None],
+        fault: Callable[[str], None],
     ) -> None:
         super().__init__("control", period_ns)
         self._arms, self._felt, self._command, self._fault = arms, felt, command, fault
@@ -461,6 +475,6 @@ class Control(Activity):
                 self.laws[k] = Hold(self._arms[k], k)
                 held = self.laws[k].step(felt, h, self._rate)
                 effects[k] = Effect(held.tau, fault=effect.fault)
-                self._fault(k, effect.fault)
+                self._fault(effect.fault)
         self._command.put(Torques(time_ns, (effects[0].tau, effects[1].tau)))
         self.report.put(Report(time_ns, (effects[0], effects[1]), (self.laws[0], self.laws[1])))

@@ -168,7 +168,7 @@ class WipeJob:
             scene, p["navigation"], threaded, o.motions, replace(scene.eraser, rub=o.rub), (home[0], home[1])
         )
         control = Control(
-            scene.arms, p["control"], estimation.felt, command, lambda k, text: mediator.faulted(k, text)
+            scene.arms, p["control"], estimation.felt, command, lambda text: mediator.faulted(text)
         )
         T = np.eye(4)
         T[:3, :3], centre = _table(scene.setting)
@@ -184,7 +184,7 @@ class WipeJob:
             scene.camera,
             scene.ink.size,
         )
-        mediator = Mediator(p["mediator"], o, others, self._tell, self._pass, self._number)
+        mediator = Mediator(p["mediator"], o, others, self._tell, self._pass, self._number, self._open is not None)
         self._mediator = mediator
         for activity in (perception, navigation, mediator, estimation, control, robot):
             activity.told = lambda name, state: self._tell("activity", f"{name} is {state}")

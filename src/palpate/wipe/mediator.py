@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
+import cv2
 import numpy as np
 from statemachine import State, StateMachine
 
@@ -32,8 +34,14 @@ MOVED = 0.008
 """a board that is seen so far from where it was has moved [m]"""
 SLIPPED = 0.002
 """the hand that holds the board has moved by so much [m]"""
-AGREE = 4.0
-"""corners of the board where it was expected, and a board found: they are the same within [pixel]"""
+PATCH, SEARCH = 16, 100
+"""half sides of what a corner looks like, and of where it is sought [pixel]"""
+SAME = 0.012
+"""two corners that went the same way differ in it by so much at most [m]"""
+LIKE = 0.75
+"""correlation from which a corner is found"""
+SHAPE = 8.0
+"""corners of a board found are so far at most from those of the nearest pose of a board of the right size [pixel]"""
 PATIENCE_NS = 2_000_000_000
 """for a torque channel to come back [ns]"""
 CALM_NS = 400_000_000
@@ -122,21 +130,50 @@ class Others:
     size: tuple[float, float]
     """of the board [m]"""
 
-    def displacement(self, look: Look, expected: Array) -> float | None:
-        """How far the board is from where it is expected [m]; None: an arm in front of it hides that."""
+    def outline(self, T_base_board: Array) -> Array:
+        """(4, 2) where the camera sees the corners of a board [pixels]."""
         W, H = self.size
         corners = np.array([[0.0, 0.0, 0.0, 1.0], [W, 0.0, 0.0, 1.0], [W, H, 0.0, 1.0], [0.0, H, 0.0, 1.0]])
         assert self.camera.T_base_camera is not None
-        lens = np.linalg.inv(self.camera.T_base_camera) @ expected
-        pixels = self.camera.project((corners @ lens.T)[:, :3])
-        boards = look.sight.boards
-        if any(float(np.linalg.norm(b.corners - pixels, axis=1).max()) < AGREE for b in boards):
-            return 0.0
-        if not boards or boards[0].confidence < SURE or not boards[0].complete or look.sight.plane is None:
-            return None
-        seen = look.sight.plane.T_base_board
-        assert seen is not None
-        return float(np.linalg.norm(seen[:3, 3] - expected[:3, 3]))
+        lens = np.linalg.inv(self.camera.T_base_camera) @ T_base_board
+        return self.camera.project((corners @ lens.T)[:, :3])
+
+    def believable(self, look: Look) -> bool:
+        """The best board in a picture is surely a board, and of the right shape."""
+        board, plane = look.sight.board, look.sight.plane
+        if board is None or plane is None or plane.T_base_board is None or board.confidence < SURE:
+            return False
+        return float(np.linalg.norm(board.corners - self.outline(plane.T_base_board), axis=1).max()) < SHAPE
+
+
+
+def displacement(reference: Look, now: Look) -> float | None:
+    """How far a board has moved between two pictures, an arm in front of the second [m]; None: too much is hidden.
+
+    What the corners looked like is sought nearby, by normalised correlation, so that light does not matter. Corners
+    that are hidden are not found; two that went the same way tell.
+    """
+    board, plane = reference.sight.board, reference.sight.plane
+    assert board is not None and plane is not None
+    first, second = (cv2.cvtColor(x.image, cv2.COLOR_BGR2GRAY) for x in (reference, now))
+    height, width = first.shape
+    ways = []
+    for corner in board.corners:
+        u, v = np.rint(corner).astype(int)
+        a, b = PATCH, PATCH + SEARCH
+        if not (a <= u < width - a and a <= v < height - a):
+            continue
+        patch = first[v - a : v + a + 1, u - a : u + a + 1]
+        left, top = max(0, u - b), max(0, v - b)
+        found = cv2.matchTemplate(second[top : v + b + 1, left : u + b + 1], patch, cv2.TM_CCOEFF_NORMED)
+        _, best, _, at = cv2.minMaxLoc(found)
+        if best > LIKE:
+            shift = np.array(at, dtype=np.float64) + [left - u + a, top - v + a]
+            ways.append(plane.to_board(corner + shift) - plane.to_board(corner))
+    for p, q in itertools.combinations(ways, 2):
+        if float(np.linalg.norm(p - q)) < SAME:
+            return float(min(np.linalg.norm(p), np.linalg.norm(q)))
+    return None
 
 
 class Mediator(Activity):
@@ -147,7 +184,9 @@ class Mediator(Activity):
         options: of the job.
         others: the activities it tells what to do.
         tell: called with what happened.
+        passed: called when a pass has begun, is halted, goes on or is done.
         number: passes that were made before.
+        broken: the last one was broken off.
     """
 
     def __init__(
@@ -158,6 +197,7 @@ class Mediator(Activity):
         tell: Callable[[Kind, str], None],
         passed: Callable[[str, Plan | None, float], None],
         number: int,
+        broken: bool,
     ) -> None:
         super().__init__("mediator", period_ns)
         self.mission = Mission()
@@ -170,7 +210,7 @@ class Mediator(Activity):
         self.looks: list[Look] = []
         self.wipe: Wipe | None = None
         self._options, self._others, self._tell, self._passed = options, others, tell, passed
-        self._fault: Slot[tuple[int, str]] = Slot()
+        self._fault: Slot[str] = Slot()
         self._cause: Cause = ""
         self._since = self._well = 0
         self._asked = False
@@ -178,15 +218,17 @@ class Mediator(Activity):
         self._law: tuple[int, Law] | None = None
         self._tries = self._grips = self._again = 0
         self._choice: Choice | None = None
+        self._reference: Look
         self._hand: Array | None = None
+        self._broken = broken  # off in the middle of a pass
         self._loose = True  # as far as is known the board stays where it is by itself
         self._checked = 0
 
     # -- from outside ----------------------------------------------------------
 
-    def faulted(self, arm: int, text: str) -> None:
+    def faulted(self, text: str) -> None:
         """Control cannot go on with an arm and holds it."""
-        self._fault.put((arm, text))
+        self._fault.put(text)
 
     def stop(self, why: str) -> None:
         """Come to a safe end."""
@@ -204,7 +246,8 @@ class Mediator(Activity):
             return
         fault = self._fault.take()
         if fault is not None and self.task == "wiping":
-            self._halt("torque" if "torque" in fault[1] else "contact", fault[1])
+            cause: Cause = "torque" if "torque" in fault else "hand" if "pushed" in fault else "contact"
+            self._halt(cause, fault)
         getattr(self, f"_{self.task}")()
 
     def _go(self, event: str) -> None:
@@ -224,6 +267,7 @@ class Mediator(Activity):
         self._cause, self.reason = cause, text
         self._tell("person" if cause == "other" else "fault", text)
         if self.task == "wiping":
+            self._broken = True
             self._passed("halted", None, 0.0)
         self._go("fail")
 
@@ -296,7 +340,7 @@ class Mediator(Activity):
             return
         self.looks.append(look)
         board, plane = look.sight.board, look.sight.plane
-        if board is None or plane is None or board.confidence < SURE or not board.complete:
+        if board is None or plane is None or not board.complete or not self._others.believable(look):
             self._tries += 1
             if self._tries < LOOKS:
                 self._asked = False
@@ -327,6 +371,7 @@ class Mediator(Activity):
             self._finish("stopped", text, resumable=True)
             return
         self._cause = ""
+        self._reference = look
         self._plan_or_end(look)
 
     def _plan_or_end(self, look: Look) -> None:
@@ -341,7 +386,7 @@ class Mediator(Activity):
         )
         if not self._choice.wipe:
             self._finish("clean", "")
-        elif self.number >= o.passes:
+        elif self.number >= o.passes and not self._broken:
             left = f"{1e2 * look.sight.covered:.2g} % of the board"
             self._finish("dirty", f"after {self.number} passes ink is still seen on {left}")
         elif not self._others.robot.held and (o.hold == "always" or (o.hold == "needed" and not self._loose)):
@@ -413,7 +458,8 @@ class Mediator(Activity):
             return
         if route.plan is not None and route.plan.left:
             self._tell("task", f"{len(route.plan.left)} places are out of the eraser's reach")
-        self.number += 1
+        self.number += not self._broken  # a pass that was broken off goes on
+        self._broken = False
         self._route_now = route
         self._go("move")
         self._paths.extend((0, p) for p in route.paths)
@@ -471,17 +517,10 @@ class Mediator(Activity):
         if look is None:
             return
         self._asked = False
-        self.checks += 1
-        away = self._others.displacement(look, self._expected())
+        away = displacement(self._reference, look)
         if away is not None and away > MOVED:
             self._halt("hand", f"the board moved by {1e3 * away:.0f} mm under the eraser")
             self._loose = False
-
-    checks = 0
-
-    def _expected(self) -> Array:
-        assert self.T_base_board is not None
-        return self.T_base_board
 
     def _safe(self) -> None:
         waited = self._now - self._since
@@ -494,6 +533,7 @@ class Mediator(Activity):
                 self.wipe.resume()
                 self._well = 0
                 self._cause = ""
+                self._broken = False
                 self._go("wipe")
                 self._passed("resumed", None, 0.0)
                 self._begin_wiping()

@@ -30,7 +30,7 @@ class JobOptions:
     """at most"""
     hold: Literal["always", "needed", "never"] = "always"
     """the other arm takes the board: before wiping; when it was seen to move; or it is left loose"""
-    look_every: float = 4.0
+    look_every: float = 2.0
     """a loose board is looked at so often while it is wiped [s]; 0: not at all"""
     colour: tuple[str, ...] | None = None
     """wipe these colours only"""

@@ -157,6 +157,7 @@ class BoardScene:
         self.torque_lost = False
         """set it: the joint torque sensors of the eraser's arm say nothing any more"""
         self._lens: _Lens | None = None
+        self._aside: _Lens | None = None
         self._rng = np.random.default_rng(self.setting.seed)
         self._rubbed: tuple[Array, float] | None = None
         self.reset(np.zeros(first.n), np.zeros(n))
@@ -456,10 +457,11 @@ class BoardScene:
         """
         s, rng = self.setting, self._rng
         if self._lens is None:
-            self._lens = _Lens(self._plant.model, *s.picture)
-        self._mj.mj_kinematics(self._plant.model, self._plant.data)
-        self._mj.mj_camlight(self._plant.model, self._plant.data)
-        rgb = self._lens.picture(self._plant.data, self._texture, self.ink.rgb)
+            eye = self._mj.MjvCamera()
+            eye.type = self._mj.mjtCamera.mjCAMERA_FIXED
+            eye.fixedcamid = self._plant.model.camera("eye").id
+            self._lens = _Lens(self._plant.model, *s.picture, eye)
+        rgb = self._shown(self._lens)
         gain = np.exp(s.lamps * rng.standard_normal()) * np.exp(0.2 * s.lamps * rng.standard_normal(3))
         light = rgb[..., ::-1].astype(np.float32) * gain.astype(np.float32)
         if s.blur > 0.0:
@@ -468,11 +470,38 @@ class BoardScene:
             light += s.noise * rng.standard_normal(light.shape, dtype=np.float32)
         return np.clip(np.rint(light), 0, 255).astype(np.uint8)
 
+    def overview(self, width: int = 960, height: int = 540) -> npt.NDArray[np.uint8]:
+        """The whole cell from aside (height, width, 3), red green blue, without noise: for people.
+
+        Raises:
+            InputError: more pixels than MuJoCo's buffer has.
+            PalpateError: no OpenGL on this machine.
+        """
+        most = _model.OFFSCREEN
+        if not (1 <= width <= most[0] and 1 <= height <= most[1]):
+            raise InputError(f"a picture must be 1x1 to {most[0]}x{most[1]} pixels, got {width}x{height}")
+        if self._aside is not None and self._aside.size != (width, height):
+            self._aside.close()
+            self._aside = None
+        if self._aside is None:
+            aside = self._mj.MjvCamera()
+            aside.type = self._mj.mjtCamera.mjCAMERA_FREE
+            aside.lookat[:] = (0.78, 0.0, 0.42)
+            aside.azimuth, aside.elevation, aside.distance = 118.0, -24.0, 2.15
+            self._aside = _Lens(self._plant.model, width, height, aside)
+        return self._shown(self._aside).copy()
+
+    def _shown(self, lens: _Lens) -> npt.NDArray[np.uint8]:
+        self._mj.mj_kinematics(self._plant.model, self._plant.data)
+        self._mj.mj_camlight(self._plant.model, self._plant.data)
+        return lens.picture(self._plant.data, self._texture, self.ink.rgb)
+
     def close(self) -> None:
         """Free what pictures took. The scene remains usable."""
-        if self._lens is not None:
-            self._lens.close()
-            self._lens = None
+        for lens in (self._lens, self._aside):
+            if lens is not None:
+                lens.close()
+        self._lens = self._aside = None
         self._plant.close()
 
     def _shapes(self, prefix: str) -> list[int]:
@@ -696,8 +725,9 @@ class BoardScene:
 class _Lens:
     """One OpenGL context for one camera, in which a texture is replaced before each picture."""
 
-    def __init__(self, model: Any, width: int, height: int) -> None:
+    def __init__(self, model: Any, width: int, height: int, view: Any) -> None:
         self._mj = mj = _model.mujoco()
+        self.size = width, height
         self._model, self._rect = model, mj.MjrRect(0, 0, width, height)
         try:
             self._gl = mj.GLContext(width, height)
@@ -710,9 +740,7 @@ class _Lens:
         mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._scene = mj.MjvScene(model, maxgeom=2000)
         self._option = mj.MjvOption()
-        self._view = mj.MjvCamera()
-        self._view.type = mj.mjtCamera.mjCAMERA_FIXED
-        self._view.fixedcamid = model.camera("eye").id
+        self._view = view
 
     def picture(self, data: Any, texture: int, face: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
         mj, model = self._mj, self._model
