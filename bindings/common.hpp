@@ -207,5 +207,6 @@ void bind_cartesian(nb::module_& m);
 void bind_velocity(nb::module_& m);
 void bind_session(nb::module_& m);
 void bind_teleop(nb::module_& m);
+void bind_fri(nb::module_& m);
 
 }  // namespace palpate_py

@@ -14,4 +14,5 @@ NB_MODULE(_core, m) {
   palpate_py::bind_velocity(m);
   palpate_py::bind_session(m);
   palpate_py::bind_teleop(m);
+  palpate_py::bind_fri(m);
 }

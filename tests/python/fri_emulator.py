@@ -272,6 +272,8 @@ class FriController(threading.Thread):
         wants = self.sequence % self.multiplier == self.multiplier - 1
         reached = fate in ("fine", "double")
         command = self._await(due) if wants and (reached or self.realtime) else None
+        if wants and not self.commands:
+            return  # time stands still as well
         if wants:
             self.answered.append(command is not None)
             self.missed += command is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import socket
 import subprocess
 import sys
@@ -15,11 +16,13 @@ import pytest
 import fri_emulator
 import palpate as pp
 from fri_emulator import ACTIVE, ARM, HOME, FriController, Network, block, doubles, fields, number
+from fri_messages import protobuf_classes
+from palpate import _core
 from palpate.arm import Arm
 from palpate.drivers import Driver
 from palpate.drivers.fri import FriDriver
 from palpate.drivers.laws import DriverLaws
-from palpate.errors import DriverError, MissingExtraError
+from palpate.errors import DriverError
 from palpate.simulate import Plant
 from waiting import following, until
 
@@ -28,7 +31,8 @@ LOCAL = "127.0.0.1"
 
 
 def make(**options: object) -> FriDriver:
-    return FriDriver(ARM, **{"port": PORT, "address": LOCAL} | options)  # type: ignore[arg-type]
+    """A driver that never answers by itself: the emulator's cycle waits for the test, however slow the computer is."""
+    return FriDriver(ARM, **{"port": PORT, "address": LOCAL, "deadline": math.inf} | options)  # type: ignore[arg-type]
 
 
 class TestFriLaws(DriverLaws):
@@ -387,11 +391,6 @@ class TestHostile:
 
 
 class TestRefusals:
-    def test_without_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(sys.modules, "google.protobuf", None)
-        with pytest.raises(MissingExtraError, match=r"palpate\[fri\]"):
-            make()
-
     def test_nobody_sends(self) -> None:
         with pytest.raises(DriverError, match=f"no monitoring message came to {LOCAL}:{PORT} within 0.1 s"):
             make(patience=0.1).connect()
@@ -423,11 +422,153 @@ class TestRefusals:
             ({"port": 80}, "30200 to 30209"),
             ({"torque_sign": 0}, "torque_sign"),
             ({"patience": float("nan")}, "patience"),
+            ({"deadline": 0.0}, "deadline"),
+            ({"deadline": float("nan")}, "deadline"),
+            ({"address": "nowhere.invalid"}, "cannot listen"),
         ],
     )
     def test_nonsense(self, options: dict[str, object], message: str) -> None:
         with pytest.raises(DriverError, match=message):
-            make(**options)
+            make(**options).connect()
+
+
+class TestDeadline:
+    """A thread answers where the program is not in time: the safe answer, once, and no command after it."""
+
+    def test_a_program_that_sleeps_keeps_the_session_and_pushes_nothing(self) -> None:
+        with FriController(PORT) as controller, make(mode="torque", deadline=0.6) as driver:
+            driver.enable()
+            begun = len(controller.commands)
+            until(lambda: len(controller.commands) > begun + 200, 60.0)  # the program does nothing
+            asleep = controller.commands[begun : begun + 200]
+            assert all(c.torque is not None and not c.torque.any() for c in asleep)
+            assert len({c.reflected for c in asleep}) == len(asleep), "a message was answered twice"
+            assert driver.late >= 200
+
+    def test_a_command_that_comes_too_late_is_not_sent(self) -> None:
+        with FriController(PORT) as controller, make(mode="torque", deadline=0.6) as driver:
+            driver.enable()
+            sample = following(driver)
+            answered = len(controller.commands)
+            until(lambda: len(controller.commands) > answered + 3, 60.0)
+            sent = driver.write(ARM.gravity_torque(sample.position) + 5.0)
+            np.testing.assert_allclose(sent, ARM.gravity_torque(sample.position))
+            until(lambda: len(controller.commands) > answered + 10, 60.0)
+            assert not any(c.torque is not None and c.torque.any() for c in controller.commands[answered:])
+
+    def test_while_nothing_is_commanded_every_message_is_answered_at_once(self) -> None:
+        with FriController(PORT, commanding=False) as controller, make(deadline=0.6):
+            until(lambda: len(controller.commands) > 100, 60.0)
+            assert all(c.position is None for c in controller.commands[:100])
+            assert controller.stale == 0
+
+
+@pytest.fixture(scope="module")
+def classes() -> dict[str, type]:
+    return protobuf_classes()
+
+
+class TestMessages:
+    """palpate's own reading and writing of the wire format, beside the protobuf package's."""
+
+    def message(self, rng: np.random.Generator, classes: dict[str, type]):
+        """A message with whatever in its fields."""
+        m = classes["Monitoring"]()
+        m.header.message_id = int(rng.choice([0x245142, 7, 2**32 - 1]))
+        m.header.sequence = int(rng.integers(0, 2**32))
+        m.robot.safety_state = int(rng.integers(-(2**31), 2**31))
+        m.robot.control_mode = int(rng.integers(0, 5))
+        m.robot.drive_state.extend(int(x) for x in rng.integers(-2, 4, rng.integers(0, 9)))
+        for name in ("measured_position", "measured_torque", "external_torque"):
+            numbers = rng.normal(size=rng.integers(0, 9)) * 10.0 ** rng.integers(-300, 300)
+            getattr(m.monitor, name).value.extend(numbers.tolist())
+        m.monitor.timestamp.sec, m.monitor.timestamp.nanosec = (int(x) for x in rng.integers(0, 2**32, 2))
+        m.connection.session_state = int(rng.integers(0, 6))
+        m.connection.quality = int(rng.integers(0, 4))
+        m.connection.send_period = int(rng.integers(0, 2**32))
+        m.connection.receive_multiplier = int(rng.integers(0, 9))
+        m.ipo.joint_position.value.extend(rng.normal(size=7).tolist())
+        m.ipo.command_mode = int(rng.integers(0, 4))
+        return m
+
+    @staticmethod
+    def same(own, m) -> None:
+        assert own.sequence == m.header.sequence
+        stamp = m.monitor.timestamp
+        assert own.time_ns == stamp.sec * 10**9 + stamp.nanosec
+        pairs = [
+            (own.position, m.monitor.measured_position.value),
+            (own.torque, m.monitor.measured_torque.value),
+            (own.external, m.monitor.external_torque.value),
+            (own.interpolated, m.ipo.joint_position.value),
+            (own.drive_state, m.robot.drive_state),
+        ]
+        for ours, theirs in pairs:
+            assert np.array_equal(ours, list(theirs)[:16], equal_nan=True)
+        assert own.safety_state == m.robot.safety_state and own.control_mode == m.robot.control_mode
+        c = m.connection
+        assert (own.session_state, own.quality) == (c.session_state, c.quality)
+        assert (own.send_period, own.receive_multiplier) == (c.send_period, c.receive_multiplier)
+        assert own.command_mode == m.ipo.command_mode
+
+    def test_what_is_read_is_what_protobuf_reads(self, classes: dict[str, type]) -> None:
+        rng = np.random.default_rng(1)
+        for _ in range(300):
+            m = self.message(rng, classes)
+            own = _core.fri_decode(m.SerializeToString())
+            assert own is not None
+            self.same(own, m)
+
+    def test_damaged_bytes_are_read_as_protobuf_reads_them_or_refused(self, classes: dict[str, type]) -> None:
+        from google.protobuf.message import DecodeError
+
+        rng = np.random.default_rng(2)
+        accepted = 0
+        for _ in range(4000):
+            data = bytearray(self.message(rng, classes).SerializeToString())
+            for _ in range(rng.integers(1, 4)):
+                kind, at = rng.integers(4), int(rng.integers(len(data)))
+                if kind == 0:
+                    data[at] = int(rng.integers(256))
+                elif kind == 1:
+                    del data[at:]
+                    data += b"\0"
+                elif kind == 2:
+                    data[at:at] = rng.bytes(rng.integers(1, 12))
+                else:
+                    data += data[at:]
+            own = _core.fri_decode(bytes(data))
+            if own is None:
+                continue
+            try:
+                m = classes["Monitoring"].FromString(bytes(data))
+            except DecodeError:
+                raise AssertionError(f"read what is no message: {data.hex()}") from None
+            self.same(own, m)
+            accepted += 1
+        assert accepted > 200
+
+    def test_noise_is_no_message(self) -> None:
+        rng = np.random.default_rng(3)
+        for _ in range(20_000):
+            _core.fri_decode(rng.bytes(rng.integers(0, 200)))
+
+    def test_what_is_written_is_read_by_protobuf(self, classes: dict[str, type]) -> None:
+        rng = np.random.default_rng(4)
+        for _ in range(200):
+            q, tau, w = rng.normal(size=7), rng.normal(size=7), rng.normal(size=6)
+            given = [v if rng.random() < 0.5 else None for v in (q, tau, w)]
+            sequence, reflected = (int(x) for x in rng.integers(0, 2**32, 2))
+            m = classes["Command"].FromString(_core.fri_encode(sequence, reflected, *given))
+            assert m.header.message_id == 0x34001
+            assert (m.header.sequence, m.header.reflected) == (sequence, reflected)
+            for part, value in zip(
+                (m.data.joint_position.value, m.data.joint_torque.value, m.data.wrench.element),
+                given,
+                strict=True,
+            ):
+                assert list(part) == ([] if value is None else value.tolist())
+            assert m.HasField("data") == any(v is not None for v in given)
 
 
 @pytest.mark.slow

@@ -27,7 +27,6 @@ _EXTRAS = {
     "dynamixel": (("dynamixel_sdk",), "arms of Dynamixel servos"),
     "feetech": (("scservo_sdk",), "arms of Feetech servos"),
     "ur": (("rtde_control", "rtde_receive"), "Universal Robots arms (Python up to 3.12)"),
-    "fri": (("google.protobuf",), "KUKA LBR arms by FRI"),
     "ros": (("cyclonedds", "yaml"), "ROS 2 without a ROS installation"),
     "xacro": (("xacro",), "arms from .xacro files"),
     "data": (("pooch",), "palpate data get"),
@@ -128,10 +127,7 @@ def _core() -> Finding:
 
 
 def _found(module: str) -> bool:
-    try:
-        return importlib.util.find_spec(module) is not None
-    except ModuleNotFoundError:  # the package that the module would be in
-        return False
+    return importlib.util.find_spec(module) is not None
 
 
 def _extra(name: str, modules: tuple[str, ...], use: str) -> Finding:
