@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from palpate import robots
+from palpate.arm import Arm
 from palpate.simulate import Plant
 
 ARM = robots.load("kuka_lbr_iiwa14")
@@ -147,6 +148,7 @@ class FriController(threading.Thread):
         realtime: a cycle lasts its period; False: until its answer has come.
         wait: for an answer in lockstep at most [s].
         commanding: the robot program runs its overlay motion.
+        arm: what moves.
     """
 
     def __init__(
@@ -162,13 +164,15 @@ class FriController(threading.Thread):
         wait: float = 0.4,
         commanding: bool = True,
         packed: bool = False,
+        arm: Arm = ARM,
     ) -> None:
         super().__init__(daemon=True)
         self.client = ("127.0.0.1", port)
         self.mode, self.layout, self.period = mode, layout, period
         self.multiplier, self.network = multiplier, network or Network()
         self.realtime, self.wait, self.commanding, self.packed = realtime, wait, commanding, packed
-        self.plant = Plant(ARM, integrator="discrete", timestep=period)
+        self.arm = arm
+        self.plant = Plant(arm, integrator="discrete", timestep=period)
         self.plant.reset(HOME, time_ns=1_000_000_000)
         self.control_mode = CONTROL_MODES[mode]
         self.state, self.safety, self.drive = WAIT, 0, 2
@@ -212,7 +216,7 @@ class FriController(threading.Thread):
     def monitoring(self) -> bytes:
         """The message of this cycle."""
         q, torque, t = self.plant.q, self.plant.torque, self.plant.time_ns
-        external = torque - ARM.gravity_torque(q)
+        external = torque - self.arm.gravity_torque(q)
         header = b"\x0d" + struct.pack("<I", 0x245142) + number(2, self.sequence) + number(3, 0)
         robot = number(1, 7) + number(2, self.safety) + 7 * number(5, self.drive)
         robot += number(6, 2) + number(7, self.control_mode)
@@ -347,16 +351,16 @@ class FriController(threading.Thread):
         q, dq = self.plant.q, self.plant.dq
         if self.state == ACTIVE and self.mode != "position":
             self.hold = q
-            tau = ARM.gravity_torque(q)
+            tau = self.arm.gravity_torque(q)
             if command is not None and command.torque is not None:
                 tau = tau + command.torque
             if command is not None and command.wrench is not None:
-                T, J = ARM.forward_kinematics(q), ARM.jacobian(q)
+                T, J = self.arm.forward_kinematics(q), self.arm.jacobian(q)
                 tau = tau + J[:3].T @ (T[:3, :3] @ command.wrench[:3])
             return tau
         if self.state == ACTIVE and command is not None and command.position is not None:
             self.hold = self.hold + np.clip(command.position - self.hold, -0.002, 0.002)
-        return ARM.inverse_dynamics(q, dq, 2500.0 * (self.hold - q) - 100.0 * dq)
+        return self.arm.inverse_dynamics(q, dq, 2500.0 * (self.hold - q) - 100.0 * dq)
 
 
 if __name__ == "__main__":  # in real time, for so many seconds; then say how it went

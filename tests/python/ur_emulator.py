@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.arm import Arm, Effort
+from palpate.arm import Arm, Effort, Limits
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 JOINTS = (
@@ -51,7 +51,7 @@ _SAFETY = {"normal": (1, 1), "protective": (1 << 2 | 1 << 10, 3), "emergency": (
 
 
 def ur5e() -> Arm:
-    """Sizes and masses the vendor publishes for a UR5e; link inertias and drive gains are round numbers."""
+    """Sizes, masses, limits as the vendor publishes for a UR5e; inertias of links and rotors, drive gains: round numbers."""
     masses = (3.761, 8.058, 2.846, 1.37, 1.3, 0.365)
     coms = (
         (0, -0.02561, 0.00193),
@@ -62,7 +62,7 @@ def ur5e() -> Arm:
         (0, 0, -0.001159),
     )
     spread = (0.03, 0.15, 0.05, 0.003, 0.003, 0.001)
-    return Arm.from_dh(
+    arm = Arm.from_dh(
         a=(0, -0.425, -0.3922, 0, 0, 0),
         alpha=(math.pi / 2, 0, 0, math.pi / 2, -math.pi / 2, 0),
         d=(0.1625, 0, 0, 0.1333, 0.0997, 0.0996),
@@ -70,6 +70,14 @@ def ur5e() -> Arm:
         joint_names=JOINTS,
         name="ur5e",
         effort=Effort.current(k_t=[0.12, 0.12, 0.12, 0.09, 0.09, 0.09], gear=101),
+    )
+    turn = 2 * math.pi
+    drives = [(150.0, 0.3)] * 3 + [(28.0, 0.06)] * 3
+    return arm.replace(
+        joints=tuple(
+            joint.replace(limits=Limits(-turn, turn, math.pi, torque), rotor_inertia=rotor)
+            for joint, (torque, rotor) in zip(arm.joints, drives, strict=True)
+        )
     )
 
 

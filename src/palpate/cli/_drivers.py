@@ -10,23 +10,54 @@ from ..errors import InputError, suggest
 
 if TYPE_CHECKING:
     from ..arm import Arm
-    from ..drivers.servos import ServoDriver
+    from ..drivers import Driver
     from ..weigh import Session
 
-DRIVERS = ("dynamixel", "feetech", "ros")
+_OPTIONS = {
+    "dynamixel": ("--port", "--bus"),
+    "feetech": ("--port", "--bus"),
+    "ur": ("--host",),
+    "fri": ("--host", "--port"),
+    "ros": ("--topic", "--states", "--stamp"),
+}
+"""driver: options that it takes, beside --rate"""
+DRIVERS = tuple(_OPTIONS)
+_RATE_HZ = {"dynamixel": 250.0, "feetech": 250.0, "ur": 500.0, "fri": 500.0}
+"""unless told otherwise"""
 
 
-def make_driver(name: str, arm: Arm, port: str | None, bus: Path | None, rate: float) -> ServoDriver:
-    """A driver by name, closed.
+def make_driver(
+    name: str, arm: Arm, *, port: str | None, bus: Path | None, host: str | None, rate: float | None
+) -> Driver:
+    """A driver by name, closed, that takes torque.
 
     Raises:
-        InputError: no such driver, no port, or a bus file that does not fit.
+        InputError: no such driver, an option that it needs or does not take, or a bus file that does not fit.
+        DriverError: a number that the driver does not take.
         MissingExtraError: its extra is not installed.
     """
     if name not in DRIVERS:
         raise InputError(f"no driver {name!r}; {suggest(name, DRIVERS, 'there are')}")
     if name == "ros":
         raise InputError("--driver ros watches an arm that others move; it cannot move one")
+    for option, value in (("--port", port), ("--bus", bus), ("--host", host)):
+        if value is not None and option not in _OPTIONS[name]:
+            takes = " and ".join(_OPTIONS[name])
+            raise InputError(f"--driver {name} takes {takes}, not {option}")
+    hertz = _RATE_HZ[name] if rate is None else rate
+    if name == "ur":
+        if host is None:
+            raise InputError("--driver ur needs --host, e.g. --host 192.168.1.10")
+        from ..drivers.ur_rtde import UrDriver
+
+        return UrDriver(arm, host, mode="torque", frequency=hertz)
+    if name == "fri":
+        from ..drivers.fri import FriDriver
+
+        if not hertz > 0.0:
+            raise InputError(f"--rate must be a number > 0 Hz, got {hertz!r}")
+        options: dict[str, Any] = {} if port is None else {"port": _number(port)}
+        return FriDriver(arm, mode="torque", period=1.0 / hertz, controller=host, **options)
     if port is None:
         raise InputError(f"--driver {name} needs --port, e.g. --port /dev/ttyUSB0")
     from ..drivers.bus import Bus
@@ -35,35 +66,54 @@ def make_driver(name: str, arm: Arm, port: str | None, bus: Path | None, rate: f
     if name == "dynamixel":
         from ..drivers.dynamixel import DynamixelDriver
 
-        return DynamixelDriver(arm, port, bus=servos, rate=rate)
+        return DynamixelDriver(arm, port, bus=servos, rate=hertz)
     if servos is None:
         raise InputError("--driver feetech needs --bus FILE: these servos do not say which version they are")
     from ..drivers.feetech import FeetechDriver
 
-    return FeetechDriver(arm, port, bus=servos, rate=rate)
+    return FeetechDriver(arm, port, bus=servos, rate=hertz)
 
 
-def bus_summary(driver: ServoDriver, session: Session) -> dict[str, Any]:
-    """Rate reached [Hz] and what happened on the bus, plain values for JSON."""
+def _number(port: str) -> int:
+    try:
+        return int(port)
+    except ValueError:
+        raise InputError(f"--port of --driver fri is a UDP port such as 30200, got {port!r}") from None
+
+
+def line_summary(driver: Driver, session: Session) -> dict[str, Any]:
+    """Rate reached [Hz] and what happened on the line to the arm, plain values for JSON."""
+    from ..drivers.fri import FriDriver
+    from ..drivers.servos import ServoDriver
+    from ..drivers.ur_rtde import UrDriver
+
     log = session.log
     rate = (len(log) - 1) / log.duration if len(log) > 1 else None
-    return {"rate_hz": rate, "rate_asked_hz": 1e9 / driver.period_ns, **asdict(driver.statistics)}
+    found: dict[str, Any] = {"rate_hz": rate, "rate_asked_hz": 1e9 / driver.period_ns}
+    if isinstance(driver, ServoDriver):
+        return {**found, **asdict(driver.statistics)}
+    if isinstance(driver, FriDriver):
+        found |= {"lost": driver.lost, "corrupt": driver.refused, "late": driver.late}
+    elif isinstance(driver, UrDriver):
+        found |= {"lost": driver.lost}
+    return {**found, "periods": len(log) + found.get("lost", 0)}
 
 
-def bus_words(summary: dict[str, Any]) -> str:
+def line_words(summary: dict[str, Any]) -> str:
     """The same for people."""
     rate = summary["rate_hz"]
     words = [
         f"{'-' if rate is None else format(rate, '.1f')} of {summary['rate_asked_hz']:g} samples per second",
         f"{summary['lost']} of {summary['periods']} lost",
     ]
+    late = "periods skipped" if "unanswered" in summary else "commands too late"
     words += [
         f"{summary[key]} {text}"
         for key, text in (
-            ("corrupt", "damaged answers"),
+            ("corrupt", "damaged answers" if "unanswered" in summary else "datagrams passed over"),
             ("unanswered", "questions unanswered"),
-            ("late", "periods skipped"),
+            ("late", late),
         )
-        if summary[key]
+        if summary.get(key)
     ]
     return ", ".join(words)

@@ -35,7 +35,7 @@ from ._common import (
     say,
     status_words,
 )
-from ._drivers import bus_summary, bus_words, make_driver
+from ._drivers import line_summary, line_words, make_driver
 
 if TYPE_CHECKING:
     from ..arm import Arm
@@ -53,7 +53,8 @@ def add(app: typer.Typer) -> None:
         help="Weigh what an arm holds, without a force sensor.\n\n"
         "Without LOG a simulated arm lifts an object from rest to a grasping pose, with noise and quantisation. "
         "With LOG the same is done for a recording of a real arm. With --driver a real arm itself moves from where it "
-        "stands to --pose: hold it, its drives are off before and after. Writes run.mcap (not with LOG) and "
+        "stands to --pose: hold it, its drives are off before and after (ur and fri: held by its controller). "
+        "Writes run.mcap (not with LOG) and "
         "report.html into the current folder; both replace those of an earlier run.",
         epilog=examples(
             "palpate weigh",
@@ -63,6 +64,7 @@ def add(app: typer.Typer) -> None:
             "palpate weigh task.mcap --arm robot.arm.yaml",
             "palpate weigh --driver dynamixel --port /dev/ttyUSB0 --bus bus.yaml --arm arm.yaml --pose 0,-0.5,1",
             "palpate weigh --driver ros --topic /joint_states --arm robot.arm.yaml --duration 20",
+            "palpate weigh --driver ur --host 192.168.1.10 --arm ur10e.arm.yaml --pose 0,-1.2,1.4,-1.5,-1.3,0",
             "palpate weigh log.csv --columns columns.yaml --arm robot.urdf --tip tool0 --effort torque",
         ),
     )(run)
@@ -139,14 +141,26 @@ def run(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="A real arm instead of a simulated one: dynamixel or feetech; or ros, an arm that others move and "
-            "publish.",
+            help="A real arm instead of a simulated one: dynamixel, feetech, ur or fri; or ros, an arm that others "
+            "move and publish.",
             show_default=False,
         ),
     ] = None,
     port: Annotated[
         str | None,
-        typer.Option(metavar="PATH", help="Its serial port, e.g. /dev/ttyUSB0.", show_default=False),
+        typer.Option(
+            metavar="PORT",
+            help="Its serial port, e.g. /dev/ttyUSB0; of fri the UDP port. [default for fri: 30200]",
+            show_default=False,
+        ),
+    ] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Of its controller (ur, fri). [default for fri: whoever sends]",
+            show_default=False,
+        ),
     ] = None,
     bus: Annotated[
         Path | None,
@@ -158,7 +172,11 @@ def run(
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option(metavar="HZ", help="Its control rate. [default: 250]", show_default=False),
+        typer.Option(
+            metavar="HZ",
+            help="Its control rate. [default: 250 for servos, 500 for ur and fri]",
+            show_default=False,
+        ),
     ] = None,
     topic: Annotated[
         str | None,
@@ -213,7 +231,11 @@ def run(
     if driver != "ros":
         only("--driver ros", "it is not given", {"--topic": topic, "--states": states, "--stamp": stamp})
     if driver is None:
-        only("a real arm", "there is no --driver", {"--port": port, "--bus": bus, "--rate": rate})
+        only(
+            "a real arm",
+            "there is no --driver",
+            {"--port": port, "--host": host, "--bus": bus, "--rate": rate},
+        )
         if log is None:
             only("a LOG", "nothing is recorded yet", {"--effort": effort})
     elif driver == "ros":
@@ -222,7 +244,7 @@ def run(
         only(
             "an arm that palpate moves",
             "others move this one",
-            {"--pose": pose, "--port": port, "--bus": bus},
+            {"--pose": pose, "--port": port, "--host": host, "--bus": bus},
         )
     else:
         given = {"--mass": mass, "--start": start, "--speed": speed, "--picture": picture}
@@ -255,7 +277,7 @@ def run(
         title = f"What {result.arm.name} holds"
     elif driver is not None:
         model = _real_arm(arm, pose, base=base, tip=tip, repair=repair)
-        hardware = make_driver(driver, model, port, bus, 250.0 if rate is None else rate)
+        hardware = make_driver(driver, model, port=port, bus=bus, host=host, rate=rate)
         target = _recording(out) if record else None
         with hardware:
             scene = weighing.scene(weighing.driven_arm(model, hardware))
@@ -271,7 +293,7 @@ def run(
             pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer)
             session = _session(task, pipeline, target, live=live, pose=name, picture=False, driver=hardware)
         result = weighing.weigh_session(session, pose=name)
-        on_bus = bus_summary(hardware, session)
+        on_bus = line_summary(hardware, session)
         if target is not None:
             files["log"] = str(target)
         title = f"What {scene.arm.name} holds"
@@ -425,7 +447,7 @@ def _tell(result: Weighing, files: dict[str, str], on_bus: dict[str, Any] | None
         )
     )
     if on_bus is not None:
-        rows.append(("bus", bus_words(on_bus)))
+        rows.append(("bus", line_words(on_bus)))
     if result.task is None:
         repair = str(result.log.repair).splitlines()
         rows.append(("read", "\n".join(repair)))
