@@ -188,6 +188,8 @@ class FriController(threading.Thread):
         self.fell_back = 0
         self.paused = False
         self.before_send: Callable[[bytes], bytes] = lambda data: data
+        self.made_for: Callable[[int, Command], bool] = lambda time_ns, command: True
+        self.foreign = 0
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
         self._delayed: list[bytes] = []
@@ -329,6 +331,7 @@ class FriController(threading.Thread):
                 continue
             command = parsed
             self.commands.append(parsed)
+            self.foreign += not self.made_for(self.plant.time_ns, parsed)
         return command
 
     def _session(self, command: Command | None) -> None:
@@ -363,12 +366,18 @@ class FriController(threading.Thread):
         return self.arm.inverse_dynamics(q, dq, 2500.0 * (self.hold - q) - 100.0 * dq)
 
 
+def wave(time_ns: int) -> float:
+    """Force [N] along z that a client lays over the motion in the run below; it tells for which message it is."""
+    return 0.1 + 0.05 * np.sin(time_ns * 1e-9)
+
+
 if __name__ == "__main__":  # in real time, for so many seconds; then say how it went
     controller = FriController(
         int(sys.argv[1]), mode="wrench", realtime=True, network=Network(float(sys.argv[3]))
     )
+    controller.made_for = lambda t, c: c.wrench is None or c.wrench[2] in (0.0, wave(t))
     controller.start()
     time.sleep(float(sys.argv[2]))
     controller.finish()
-    words = ("cycles", "missed", "stale", "fell_back", "state")
+    words = ("cycles", "missed", "stale", "foreign", "fell_back", "state")
     print(json.dumps({w: getattr(controller, w) for w in words} | {"time_ns": controller.plant.time_ns}))

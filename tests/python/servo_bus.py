@@ -445,8 +445,14 @@ def main(text: str) -> None:
                 time.sleep(0.01)
             time.sleep(options["die_after"])
             bus.dead.add(options["die"])
+            died = time.monotonic()
+            while any(t[bus.ENABLE] for i, t in bus.tables.items() if i not in bus.dead):
+                time.sleep(1e-4)
+            off_s = time.monotonic() - died
         sys.stdin.read()
     said = {"questions": bus.questions, "damaged": bus.damaged, "dropped": bus.dropped}
+    if options.get("die"):
+        said["off_s"] = off_s
     on = [i for i, t in bus.tables.items() if t[bus.ENABLE]]
     print(json.dumps({**said, "on": on, "q": bus.world.q.tolist()}), flush=True)
 

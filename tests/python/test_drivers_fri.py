@@ -588,7 +588,7 @@ def test_two_milliseconds_for_a_minute(loss: float) -> None:
                         ended += 1
                         driver.enable()
                     elif sample is not None:
-                        driver.wrench([0, 0, 0.1 * np.sin(sample.time_ns * 1e-9), 0, 0, 0])
+                        driver.wrench([0, 0, fri_emulator.wave(sample.time_ns), 0, 0, 0])
                         answers.append(time.monotonic() - begin)
             late, lost = driver.late, driver.lost
         assert process.stdout is not None
@@ -598,5 +598,6 @@ def test_two_milliseconds_for_a_minute(loss: float) -> None:
         f"FRI 2 ms, {loss:.0%} lost each way: {seen['cycles']} cycles, {seen['missed']} without an answer in time, "
         f"{lost} not seen, {late} late, session ended {ended} times; a command takes {p50:.0f} us, p99.9 {p999:.0f} us"
     )
+    assert seen["foreign"] == 0, "a command acted that was made for another message"
     assert 0 <= seen["fell_back"] - ended <= 1  # the last one may come after the last sample
     assert len(answers) > 0  # how many is the machine's matter: printed, not judged

@@ -51,7 +51,7 @@ _SAFETY = {"normal": (1, 1), "protective": (1 << 2 | 1 << 10, 3), "emergency": (
 
 
 def ur5e() -> Arm:
-    """Sizes, masses, limits as the vendor publishes for a UR5e; inertias of links and rotors, drive gains: round numbers."""
+    """Sizes, masses, limits as the vendor publishes for a UR5e; all inertias and the drive gains are round numbers."""
     masses = (3.761, 8.058, 2.846, 1.37, 1.3, 0.365)
     coms = (
         (0, -0.02561, 0.00193),

@@ -148,6 +148,14 @@ _ALL = (
     Study("session", "The real-time session at 1 kHz while the computer is busy", "bench", timed=True),
     Study("view", "The live page: first picture, updates, memory", "bench", timed=True),
     Study("ros2", "ROS 2 beside Fast DDS and ros2-client; the published graph as processes", "bench"),
+    Study(
+        "servos",
+        "Seven emulated Dynamixel servos weigh: rate, damaged answers, a dead servo",
+        "bench",
+        timed=True,
+    ),
+    Study("rtde", "An emulated UR at 500 Hz: age of the samples, a cut connection", "bench", timed=True),
+    Study("fri", "An emulated KUKA LBR at 2 ms: the session holds, no stale command", "bench", timed=True),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
 

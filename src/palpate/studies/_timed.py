@@ -39,6 +39,20 @@ def lasted(seconds: float) -> str:
     )
 
 
+def priority() -> bool:
+    """Real-time priority for this process and what it starts, where that is allowed; whether it is."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    except OSError:
+        return False
+    return True
+
+
+def priority_words(granted: bool) -> str:
+    """The same as a sentence."""
+    return "All processes had real-time priority." if granted else "No process had real-time priority."
+
+
 @contextmanager
 def hogs(kind: str = "computing") -> Iterator[int]:
     """A process for every processor that does nothing but computing, or copying memory; how many."""
