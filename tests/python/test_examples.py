@@ -24,6 +24,7 @@ EXTRAS = {
     "identify": "scipy",
     "vision": "cv2",
     "wipe": "shapely",
+    "teleop": "cryptography",
 }
 
 

@@ -6,7 +6,22 @@ from typing import Annotated, Any
 
 import typer
 
-from . import arm, bench, data, doctor, excite, feel, identify, replay, reproduce, see, simulate, tare, teleop, weigh
+from . import (
+    arm,
+    bench,
+    data,
+    doctor,
+    excite,
+    feel,
+    identify,
+    replay,
+    reproduce,
+    see,
+    simulate,
+    tare,
+    teleop,
+    weigh,
+)
 
 app = typer.Typer(
     name="palpate",
