@@ -25,6 +25,7 @@ EXTRAS = {
     "vision": "cv2",
     "wipe": "shapely",
     "ros": "cyclonedds",
+    "teleop": "cryptography",
 }
 
 

@@ -12,7 +12,17 @@ import pytest
 from palpate import _core
 from palpate.cli import main
 from palpate.errors import DriverError, InputError
-from palpate.teleop import Event, Hand, HapticDevice, Keys, MasterSide, Message, SlaveSide, event_words, felt_force
+from palpate.teleop import (
+    Event,
+    Hand,
+    HapticDevice,
+    Keys,
+    MasterSide,
+    Message,
+    SlaveSide,
+    event_words,
+    felt_force,
+)
 
 H = 1e-3
 
@@ -22,7 +32,9 @@ def sides(**options: Any) -> tuple[MasterSide, SlaveSide]:
     return MasterSide(1, 20.0, session=1), SlaveSide(1, 0.5, session=1, **{**slave, **options})
 
 
-def exchange(master: MasterSide, slave: SlaveSide, x: float, v: float, at: float, force: float, k: int) -> tuple[Any, Any]:
+def exchange(
+    master: MasterSide, slave: SlaveSide, x: float, v: float, at: float, force: float, k: int
+) -> tuple[Any, Any]:
     felt = master.step(np.array([x]), np.array([v]), H, k)
     slave.receive(master.message())
     command = slave.step(np.array([at]), np.zeros(1), np.array([force]), np.zeros(1), H, k)
@@ -168,7 +180,9 @@ def test_a_dead_link_holds_and_comes_back_without_a_jump() -> None:
 def test_delay_shakes_it_without_the_layer_and_not_with_it() -> None:
     shaking = {}
     for passive in (True, False):
-        found = build("wall", stiffness=5000.0, passive=passive).run(seconds=6.0, faults=Faults(delay=0.06, loss=0.1))
+        found = build("wall", stiffness=5000.0, passive=passive).run(
+            seconds=6.0, faults=Faults(delay=0.06, loss=0.1)
+        )
         late = found.time > 4.0
         shaking[passive] = float(found.device_velocity[late].std())
         if passive:
@@ -223,7 +237,9 @@ def test_scenes_and_arms_by_name() -> None:
         build("lift", masses=(0.0,))
 
 
-def test_the_command_writes_a_report_and_one_log_of_both_sides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_a_report_and_one_log_of_both_sides(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("rosbags")
     assert main(["teleop", "free", "--seconds", "1.5", "--out", str(tmp_path), "--json"]) == 0

@@ -11,7 +11,19 @@ import typer
 
 from ..errors import InputError
 from . import STOPPED
-from ._common import Json, Quiet, check_target, console, emit, examples, is_recording, is_report, make_folder, print_rows, say
+from ._common import (
+    Json,
+    Quiet,
+    check_target,
+    console,
+    emit,
+    examples,
+    is_recording,
+    is_report,
+    make_folder,
+    print_rows,
+    say,
+)
 from ._live import interruptible
 
 if TYPE_CHECKING:
@@ -23,7 +35,8 @@ def add(app: typer.Typer) -> None:
     app.command(
         "teleop",
         help="Teleoperate a simulated arm and feel what it touches, without a force sensor.\n\n"
-        "A scripted hand holds a simulated haptic device; the arm follows it in MuJoCo. Scenes: wall (press a spring of known stiffness), "
+        "A scripted hand holds a simulated haptic device; the arm follows it in MuJoCo. Scenes: wall (press "
+        "a spring of known stiffness), "
         "surface (trace it), peg (into a hole), lift (objects whose masses nobody knows), free (nothing to touch). "
         "Delay, jitter, loss and dead links come from a fault layer; every message is encrypted and authenticated.",
         epilog=examples(
@@ -38,41 +51,82 @@ def add(app: typer.Typer) -> None:
 
 
 def run(
-    scene: Annotated[str, typer.Argument(metavar="[SCENE]", help="wall, surface, peg, lift or free.", show_default=False)] = "wall",
-    arm: Annotated[str, typer.Option(metavar="ARM", help="The slave: kuka_lbr_iiwa14 or kuka_lbr_iiwa7.")] = "kuka_lbr_iiwa14",
+    scene: Annotated[
+        str, typer.Argument(metavar="[SCENE]", help="wall, surface, peg, lift or free.", show_default=False)
+    ] = "wall",
+    arm: Annotated[
+        str, typer.Option(metavar="ARM", help="The slave: kuka_lbr_iiwa14 or kuka_lbr_iiwa7.")
+    ] = "kuka_lbr_iiwa14",
     coupling: Annotated[
-        str, typer.Option(metavar="NAME", help="force_position (as published), position_position or four_channel.")
+        str,
+        typer.Option(
+            metavar="NAME", help="force_position (as published), position_position or four_channel."
+        ),
     ] = "force_position",
     stiffness: Annotated[float, typer.Option(metavar="N/M", help="Of the wall.")] = 2000.0,
-    press: Annotated[float, typer.Option(metavar="M", help="How far behind wall or surface the hand goes.")] = 0.02,
+    press: Annotated[
+        float, typer.Option(metavar="M", help="How far behind wall or surface the hand goes.")
+    ] = 0.02,
     mass: Annotated[
         list[float] | None,
-        typer.Option(metavar="KG", help="Object to lift; again for the next one. [default: 0.5 1.2]", show_default=False),
+        typer.Option(
+            metavar="KG",
+            help="Object to lift; again for the next one. [default: 0.5 1.2]",
+            show_default=False,
+        ),
     ] = None,
-    motion_scale: Annotated[float, typer.Option(metavar="S", help="Motion of the arm per motion of the hand.")] = 1.0,
+    motion_scale: Annotated[
+        float, typer.Option(metavar="S", help="Motion of the arm per motion of the hand.")
+    ] = 1.0,
     force_scale: Annotated[
-        float | None, typer.Option(metavar="S", help="Force felt per force touched. [default: what suits the arm]", show_default=False)
+        float | None,
+        typer.Option(
+            metavar="S",
+            help="Force felt per force touched. [default: what suits the arm]",
+            show_default=False,
+        ),
     ] = None,
     delay: Annotated[float, typer.Option(metavar="S", help="Of every message, each way.")] = 0.0,
-    jitter: Annotated[float, typer.Option(metavar="S", help="Uniform, on top of the delay; messages overtake one another.")] = 0.0,
+    jitter: Annotated[
+        float, typer.Option(metavar="S", help="Uniform, on top of the delay; messages overtake one another.")
+    ] = 0.0,
     loss: Annotated[float, typer.Option(metavar="P", help="Probability that a message is lost.")] = 0.0,
-    duplicate: Annotated[float, typer.Option(metavar="P", help="Probability that a message comes twice.")] = 0.0,
+    duplicate: Annotated[
+        float, typer.Option(metavar="P", help="Probability that a message comes twice.")
+    ] = 0.0,
     cut: Annotated[
         list[str] | None,
-        typer.Option(metavar="AT@FOR", help="The link dies at a time, for so long [s]; again for the next.", show_default=False),
+        typer.Option(
+            metavar="AT@FOR",
+            help="The link dies at a time, for so long [s]; again for the next.",
+            show_default=False,
+        ),
     ] = None,
     passivity: Annotated[
-        bool, typer.Option("--passivity/--no-passivity", help="The passivity layer; without it see what delay does.")
+        bool,
+        typer.Option(
+            "--passivity/--no-passivity", help="The passivity layer; without it see what delay does."
+        ),
     ] = True,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="How long. [default: as long as the scene takes]", show_default=False)
+        float | None,
+        typer.Option(metavar="S", help="How long. [default: as long as the scene takes]", show_default=False),
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Of noise and faults.")] = 0,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for report.html and teleop.mcap.")] = Path("teleop"),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for report.html and teleop.mcap.")
+    ] = Path("teleop"),
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write report.html.")] = True,
-    record: Annotated[bool, typer.Option("--record/--no-record", help="Write teleop.mcap, both sides in one log.")] = True,
+    record: Annotated[
+        bool, typer.Option("--record/--no-record", help="Write teleop.mcap, both sides in one log.")
+    ] = True,
     new_key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a new key for the channel between two machines, and stop.", show_default=False)
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write a new key for the channel between two machines, and stop.",
+            show_default=False,
+        ),
     ] = None,
     json: Json = False,
     quiet: Quiet = False,
@@ -82,7 +136,9 @@ def run(
         from ..teleop import make_key
 
         path = make_key(new_key)
-        emit({"key": str(path)}) if json else say(f"{path}: a new key, readable by you alone; both machines need the same")
+        emit({"key": str(path)}) if json else say(
+            f"{path}: a new key, readable by you alone; both machines need the same"
+        )
         return 0
     from ..teleop.channel import Faults
     from ..teleop.coupling import COUPLINGS

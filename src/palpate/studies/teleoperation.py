@@ -1,4 +1,5 @@
-"""A hand feels what a light arm touches: tracking, force and stiffness felt, onset, dead links, a bad network; in MuJoCo."""
+"""A hand feels what a light arm touches: tracking, force and stiffness felt, onset, dead links, a bad network; in
+MuJoCo."""
 
 from __future__ import annotations
 
@@ -73,12 +74,17 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     next_one()
     rows = _rows(free, pressed, dead, with_layer, without, times)
     setup_notes = [
-        "Slave: KUKA LBR iiwa 14 in MuJoCo with a stick of 12 cm, its model known exactly; encoders of 1 microradian, velocities with 0.1 mrad/s and "
-        "torques with 0.05 N m of noise at 1 kHz, which no source states. Master: a device of 75 g, 8.5 N, 0.03 mm, held by a hand of 0.5 kg, "
+        "Slave: KUKA LBR iiwa 14 in MuJoCo with a stick of 12 cm, its model known exactly; encoders of 1 "
+        "microradian, velocities with 0.1 mrad/s and "
+        "torques with 0.05 N m of noise at 1 kHz, which no source states. Master: a device of 75 g, 8.5 N, "
+        "0.03 mm, held by a hand of 0.5 kg, "
         "400 N/m, 14 N s/m with tremor. Every message goes through the encrypted packets of the channel.",
-        "True forces are those of MuJoCo's contacts. Force felt and true are compared over tenths of a second while the hand holds.",
-        "The contact itself gives: between the tool's way and the spring's. Stiffness felt is against what the tool meets.",
-        "Not measured here: SO-101 (no figures of it to write an arm from), the ABB IRB 2400 with phase currents as slave.",
+        "True forces are those of MuJoCo's contacts. Force felt and true are compared over tenths of a "
+        "second while the hand holds.",
+        "The contact itself gives: between the tool's way and the spring's. Stiffness felt is against what "
+        "the tool meets.",
+        "Not measured here: SO-101 (no figures of it to write an arm from), the ABB IRB 2400 with phase "
+        "currents as slave.",
     ]
     return rows, _figures.drawn(lambda: _draw(free_run, pressed, with_layer, without)), setup_notes
 
@@ -122,7 +128,11 @@ def _rows(
     for K, (_, t) in pressed.items():
         rows += [
             at_most(
-                f"wall of {K:g} N/m: force felt off the true one, mean", 5.0, 100.0 * t.force_error, "%", f"at {t.force_held:.1f} N"
+                f"wall of {K:g} N/m: force felt off the true one, mean",
+                5.0,
+                100.0 * t.force_error,
+                "%",
+                f"at {t.force_held:.1f} N",
             ),
             Row(
                 f"wall of {K:g} N/m: stiffness felt, part of what the tool meets",
@@ -133,21 +143,36 @@ def _rows(
                 "%",
                 f"the tool meets {100.0 * t.met:.0f} % of the spring's",
             ),
-            at_most(f"wall of {K:g} N/m: felt after the touch", 20.0, 1e3 * t.onset, "ms", "no delay on the line"),
+            at_most(
+                f"wall of {K:g} N/m: felt after the touch", 20.0, 1e3 * t.onset, "ms", "no delay on the line"
+            ),
         ]
     lost = [d for seconds, d in dead.items() if seconds > 0.3]
     rows += [
-        at_most("dead links of 0.1 to 10 s while pressing: force changes within 10 ms, at most", 2.0, max(d[0] for d in dead.values()), "N"),
         at_most(
-            "dead links: velocity of the tool changes within 10 ms, at most", 5.0, 1e3 * max(d[1] for d in dead.values()), "mm/s"
+            "dead links of 0.1 to 10 s while pressing: force changes within 10 ms, at most",
+            2.0,
+            max(d[0] for d in dead.values()),
+            "N",
         ),
-        told("dead links: the slave's reference moves meanwhile, at most", 1e3 * max((d[2] for d in lost), default=0.0), "mm"),
+        at_most(
+            "dead links: velocity of the tool changes within 10 ms, at most",
+            5.0,
+            1e3 * max(d[1] for d in dead.values()),
+            "mm/s",
+        ),
+        told(
+            "dead links: the slave's reference moves meanwhile, at most",
+            1e3 * max((d[2] for d in lost), default=0.0),
+            "mm",
+        ),
     ]
     for name, run_ in (("with the layer", with_layer), ("without", without)):
         late = run_.time > run_.time[-1] - 1.0
         rows.append(
             told(
-                f"100 ms each way, jitter 50 ms, loss 20 %, wall of 5 kN/m, {name}: RMS force of the device in the last second",
+                f"100 ms each way, jitter 50 ms, loss 20 %, wall of 5 kN/m, {name}: RMS force of the device in the "
+                "last second",
                 float(np.sqrt(np.mean(np.square(run_.force[late])))),
                 "N",
                 f"largest true force {np.linalg.norm(run_.true, axis=1).max():.0f} N; the hand has long come back",
@@ -192,7 +217,10 @@ def _draw(
             {"distance": (free.time, 1e3 * np.linalg.norm(free.tip - free.wanted, axis=1))}, "distance [mm]"
         ),
         "100 ms each way, jitter, 20 % loss: force of the device": _figures.curves(
-            {"with the layer": (with_layer.time, with_layer.force[:, 0]), "without": (without.time, without.force[:, 0])},
+            {
+                "with the layer": (with_layer.time, with_layer.force[:, 0]),
+                "without": (without.time, without.force[:, 0]),
+            },
             "force [N]",
         ),
     }

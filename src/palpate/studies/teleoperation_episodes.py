@@ -1,4 +1,5 @@
-"""Ten thousand random teleoperators on random bad networks: with the passivity layer, without, and with wave variables."""
+"""Ten thousand random teleoperators on random bad networks: with the passivity layer, without, and with wave
+variables."""
 
 from __future__ import annotations
 
@@ -40,7 +41,9 @@ def _unstable(result: Mapping[str, Any]) -> bool:
 def _broken(was: Mapping[str, Any], result: Mapping[str, Any]) -> bool:
     slack = 1.0 + 1e-9
     return bool(
-        not result["finite"] or result["force"] > was["force_limit"] * slack or result["speed"] > was["speed"] * slack
+        not result["finite"]
+        or result["force"] > was["force_limit"] * slack
+        or result["speed"] > was["speed"] * slack
     )
 
 
@@ -76,10 +79,19 @@ def _rows(found: Mapping[str, Found]) -> list[Row]:
             charge,
             max(r["generated"] for r in results),
             "J",
-            f"the tanks' initial charge is {1e3 * charge:g} mJ together; measured at the simulated ports, not by the tanks",
+            f"the tanks' initial charge is {1e3 * charge:g} mJ together; measured at the simulated ports, not by "
+            "the tanks",
         ),
-        at_most("episodes in which a limit is broken (force, speed)", 0, sum(_broken(c, r) for c, r in ours), ""),
-        at_most("unstable episodes", 0, sum(map(_unstable, results)), "", f"made more than {GENERATED:g} J, or shook on"),
+        at_most(
+            "episodes in which a limit is broken (force, speed)", 0, sum(_broken(c, r) for c, r in ours), ""
+        ),
+        at_most(
+            "unstable episodes",
+            0,
+            sum(map(_unstable, results)),
+            "",
+            f"made more than {GENERATED:g} J, or shook on",
+        ),
         told("lowest level of a tank", min(r["lowest"] for r in results), "J"),
         told(
             "RMS speed long after the hand wants to be still: median, 99 %, worst",
@@ -101,7 +113,12 @@ def _rows(found: Mapping[str, Found]) -> list[Row]:
             "m/s",
             f"more than that in {int((speed > SPEED_JUMP).sum())} of {len(cut)}",
         ),
-        at_most("dead links: the slave's reference moves meanwhile", 0, max(r["hold_motion"] for _, r in cut) if cut else 0.0, "m"),
+        at_most(
+            "dead links: the slave's reference moves meanwhile",
+            0,
+            max(r["hold_motion"] for _, r in cut) if cut else 0.0,
+            "m",
+        ),
     ]
     for layer, name in (("none", "without the layer"), ("waves", "wave variables")):
         theirs = [r for _, r in found[layer]]
@@ -114,7 +131,10 @@ def _rows(found: Mapping[str, Found]) -> list[Row]:
             )
         )
     same = len(found["waves"])
-    drift = {layer: float(np.median([r["drift"] for c, r in found[layer][:same] if c["axes"] > 1])) for layer in ("tanks", "waves")}
+    drift = {
+        layer: float(np.median([r["drift"] for c, r in found[layer][:same] if c["axes"] > 1]))
+        for layer in ("tanks", "waves")
+    }
     rows.append(
         told(
             "slave away from where the hand points at the end, free axes, median",
@@ -127,13 +147,21 @@ def _rows(found: Mapping[str, Found]) -> list[Row]:
 
 
 def _notes(ours: Found) -> list[str]:
-    kinds = {name: sum(c["coupling"] == name for c, _ in ours) for name in ("force_position", "position_position", "four_channel")}
+    kinds = {
+        name: sum(c["coupling"] == name for c, _ in ours)
+        for name in ("force_position", "position_position", "four_channel")
+    }
     return [
-        f"Episodes of 10 s and more: {', '.join(f'{n} {k}' for k, n in kinds.items())}; one to three axes; delay 0 to 500 ms each way, jitter to "
-        "100 ms (messages overtake one another), loss to 20 %, repetition to 10 %; walls of 0.1 to 20 kN/m; hands of 0 to 800 N/m "
-        "(a tenth let go of the device), tremor to 0.5 N; slaves of 0.5 to 20 kg; scales of 0.25 to 4 and 0.1 to 2; half with a dead link.",
-        "Energy is counted at the ports of the simulated physics: force of the device times way of the hand, force of the position control's spring "
-        "and damper times way of the reference. Hand, device, slave and wall are passive, so what appears is made by coupling and network.",
+        f"Episodes of 10 s and more: {', '.join(f'{n} {k}' for k, n in kinds.items())}; one to three axes; "
+        "delay 0 to 500 ms each way, jitter to "
+        "100 ms (messages overtake one another), loss to 20 %, repetition to 10 %; walls of 0.1 to 20 kN/m; "
+        "hands of 0 to 800 N/m "
+        "(a tenth let go of the device), tremor to 0.5 N; slaves of 0.5 to 20 kg; scales of 0.25 to 4 and "
+        "0.1 to 2; half with a dead link.",
+        "Energy is counted at the ports of the simulated physics: force of the device times way of the hand, "
+        "force of the position control's spring "
+        "and damper times way of the reference. Hand, device, slave and wall are passive, so what appears is "
+        "made by coupling and network.",
         "Links of 0.1 to 0.3 s of silence do not count as dead: the timeout is 0.25 s.",
     ]
 
@@ -146,7 +174,10 @@ def _draw(found: Mapping[str, Found]) -> dict[str, Any]:
     names = {"tanks": "palpate", "none": "without the layer", "waves": "wave variables"}
     return {
         "RMS speed long after the hand wants to be still, share of the episodes below": _figures.curves(
-            {names[k]: share([max(r["shaking"], r["slave_shaking"]) for _, r in rows]) for k, rows in found.items()},
+            {
+                names[k]: share([max(r["shaking"], r["slave_shaking"]) for _, r in rows])
+                for k, rows in found.items()
+            },
             "speed [m/s]",
             level=(SHAKING, "unstable"),
             log=True,

@@ -1,4 +1,5 @@
-"""Teleoperation: a hand moves a master, an arm elsewhere follows, and the hand feels what the arm touches, without a force sensor."""
+"""Teleoperation: a hand moves a master, an arm elsewhere follows, and the hand feels what the arm touches, without
+a force sensor."""
 
 from __future__ import annotations
 

@@ -5,8 +5,10 @@ A packet is a header in the clear and a body sealed with ChaCha20-Poly1305 (RFC 
     "PT"  version u8  role u8 | salt 8 bytes | session u64 | sequence u64 | sealed body | tag 16 bytes
     body: echo 8 bytes | time i64 | echo_time i64 | echo_age i64 | n u8 | flags u8 | energy f64 | level f64 | 3 n f64
 
-The key of a direction in a run is HKDF-SHA256(shared key, salt, role), so a sequence number, which is the nonce, never meets a key
-twice. ``echo`` is the salt that was heard from the other side: a packet that does not echo the salt of *this* run is a greeting and carries
+The key of a direction in a run is HKDF-SHA256(shared key, salt, role), so a sequence number, which is the nonce,
+never meets a key
+twice. ``echo`` is the salt that was heard from the other side: a packet that does not echo the salt of *this* run
+is a greeting and carries
 no motion, so what was recorded in an earlier run cannot be played back. Within a run a window refuses what came before.
 """
 
@@ -111,17 +113,23 @@ def read_key(path: str | os.PathLike[str]) -> bytes:
         mode = target.stat().st_mode
         text = target.read_text(encoding="ascii").strip()
     except OSError as error:
-        raise ChannelError(f"{target}: cannot be read: {error.strerror or error}; palpate teleop --new-key FILE makes one") from None
+        raise ChannelError(
+            f"{target}: cannot be read: {error.strerror or error}; palpate teleop --new-key FILE makes one"
+        ) from None
     except UnicodeDecodeError:
         text = ""
     if stat.S_IMODE(mode) & 0o077:
-        raise ChannelError(f"{target}: others may read this key (mode {stat.S_IMODE(mode):04o}): chmod 600 {target}, or make a new one")
+        raise ChannelError(
+            f"{target}: others may read this key (mode {stat.S_IMODE(mode):04o}): chmod 600 {target}, or make a new one"
+        )
     try:
         key = bytes.fromhex(text)
     except ValueError:
         key = b""
     if len(key) != 32:
-        raise ChannelError(f"{target}: expected a key of 64 hexadecimal digits; palpate teleop --new-key FILE makes one")
+        raise ChannelError(
+            f"{target}: expected a key of 64 hexadecimal digits; palpate teleop --new-key FILE makes one"
+        )
     return key
 
 
@@ -210,7 +218,14 @@ class Sealer:
         if rows.shape != (3 * self.n,):
             raise InputError(f"message: expected {self.n} axes, got {len(rows)} numbers in all")
         body = _BODY.pack(
-            self._echo, now_ns, echo_time, echo_age, self.n, int(message.engaged), message.energy, message.level
+            self._echo,
+            now_ns,
+            echo_time,
+            echo_age,
+            self.n,
+            int(message.engaged),
+            message.energy,
+            message.level,
         )
         header = _HEADER.pack(b"PT", VERSION, _number(self.role), self.salt, self.session, message.sequence)
         return header + self._out.encrypt(_nonce(message.sequence), body + rows.tobytes(), header)
@@ -222,7 +237,11 @@ class Sealer:
         header = packet[: _HEADER.size]
         _, version, role, salt, session, sequence = _HEADER.unpack(header)
         if version != VERSION:
-            return self._refuse("version", f"the other side speaks protocol version {version}, this one {VERSION}: install the same palpate on both")
+            return self._refuse(
+                "version",
+                f"the other side speaks protocol version {version}, this one {VERSION}: install the same palpate on "
+                "both",
+            )
         if role == _number(self.role):
             return self._refuse("role", f"both sides say they are the {self.role}")
         if session < self._peer_session:
@@ -231,14 +250,17 @@ class Sealer:
         try:
             body = cipher.decrypt(_nonce(sequence), packet[_HEADER.size :], header)
         except _invalid_tag():
-            return self._refuse("forged", "another key, or changed on the way: the two sides need the same key file")
+            return self._refuse(
+                "forged", "another key, or changed on the way: the two sides need the same key file"
+            )
         if len(body) < _BODY.size:
             return self._refuse("length", f"a body of {len(body)} bytes")
         echo, sent_ns, echo_time, echo_age, n, flags, energy, level = _BODY.unpack(body[: _BODY.size])
         if n != self.n or len(body) != _BODY.size + 24 * n:
             return self._refuse("axes", f"the other side has {n} axes, this one {self.n}")
         if echo != self.salt:
-            # Whoever is there now will hear our salt and echo it; what was recorded never will. A live side is not left for it.
+            # Whoever is there now will hear our salt and echo it; what was recorded never will. A live side is not
+            # left for it.
             if self._heard is None or now_ns - self._heard[1] > _SILENCE_NS:
                 self._echo = salt
             return self._refuse("greeting", "a greeting, or of an earlier run: it does not know this one")
@@ -247,18 +269,32 @@ class Sealer:
             self._newest, self._seen, self._heard = 0, 0, None
             self.clock = Clock()
         if not self._fresh(sequence):
-            return self._refuse("replayed", f"number {sequence} has come before, or is far behind: replayed or repeated")
+            return self._refuse(
+                "replayed", f"number {sequence} has come before, or is far behind: replayed or repeated"
+            )
         if echo_age >= 0:
             self.clock.take(echo_time, sent_ns - echo_age, sent_ns, now_ns)
         self._heard = (sent_ns, now_ns)
         if not abs(self.clock.offset) <= MAX_CLOCK_OFFSET and not math.isnan(self.clock.offset):
             return self._refuse(
-                "clocks", f"the clocks differ by {self.clock.offset:+.0f} s: set them (chrony, NTP); at most {MAX_CLOCK_OFFSET:g} s are allowed"
+                "clocks",
+                f"the clocks differ by {self.clock.offset:+.0f} s: set them (chrony, NTP); at most "
+                f"{MAX_CLOCK_OFFSET:g} s are allowed",
             )
         values = np.frombuffer(body, dtype=">f8", offset=_BODY.size).astype(np.float64)
         if not (np.isfinite(values).all() and math.isfinite(energy) and math.isfinite(level)):
             return self._refuse("not finite", "a number is not finite")
-        return Message(session, sequence, sent_ns, values[:n], values[n : 2 * n], values[2 * n :], energy, level, bool(flags & 1))
+        return Message(
+            session,
+            sequence,
+            sent_ns,
+            values[:n],
+            values[n : 2 * n],
+            values[2 * n :],
+            energy,
+            level,
+            bool(flags & 1),
+        )
 
     def _cipher(self, salt: bytes) -> Any:
         """Of what the other side sends in the run with this salt."""
@@ -314,7 +350,10 @@ def _cryptography() -> Any:
 def _cipher(shared: bytes, salt: bytes, role: Role) -> Any:
     primitives = _cryptography().hazmat.primitives
     kdf = primitives.kdf.hkdf.HKDF(
-        algorithm=primitives.hashes.SHA256(), length=32, salt=salt, info=f"palpate teleop {VERSION} {role}".encode()
+        algorithm=primitives.hashes.SHA256(),
+        length=32,
+        salt=salt,
+        info=f"palpate teleop {VERSION} {role}".encode(),
     )
     return primitives.ciphers.aead.ChaCha20Poly1305(kdf.derive(shared))
 
@@ -346,7 +385,13 @@ class Faults:
     """probability that a packet comes twice [1]"""
 
     def __post_init__(self) -> None:
-        for name, most in (("delay", 60.0), ("jitter", 60.0), ("loss", 1.0), ("reorder", 1.0), ("duplicate", 1.0)):
+        for name, most in (
+            ("delay", 60.0),
+            ("jitter", 60.0),
+            ("loss", 1.0),
+            ("reorder", 1.0),
+            ("duplicate", 1.0),
+        ):
             value = getattr(self, name)
             if not 0.0 <= value <= most:
                 raise InputError(f"faults: {name} must be 0 to {most:g}, got {value!r}")
@@ -360,7 +405,7 @@ class FaultyLine:
         seed: of the random numbers.
     """
 
-    def __init__(self, faults: Faults = Faults(), seed: int = 0) -> None:  # noqa: B008
+    def __init__(self, faults: Faults = Faults(), seed: int = 0) -> None:
         self.faults = faults
         self._rng = np.random.default_rng(seed)
         self._way: list[tuple[int, int, bytes]] = []
@@ -373,7 +418,11 @@ class FaultyLine:
         f, rng = self.faults, self._rng
         copies = 2 if rng.random() < f.duplicate else 1
         for _ in range(copies):
-            lost, late, hurry = rng.random() < f.loss, f.delay + f.jitter * rng.random(), rng.random() < f.reorder
+            lost, late, hurry = (
+                rng.random() < f.loss,
+                f.delay + f.jitter * rng.random(),
+                rng.random() < f.reorder,
+            )
             if lost or self.cut:
                 continue
             self._count += 1
@@ -431,7 +480,9 @@ class UdpChannel:
             self._socket.setblocking(False)
         except OSError as error:
             self._socket.close()
-            raise ChannelError(f"{local[0]}:{local[1]}: cannot listen there: {error.strerror or error}") from None
+            raise ChannelError(
+                f"{local[0]}:{local[1]}: cannot listen there: {error.strerror or error}"
+            ) from None
         self._begin = clock()
         self.sent_bytes = self.received_bytes = 0
 
@@ -468,9 +519,11 @@ class UdpChannel:
             self._socket.sendto(packet, self._peer)
             self.sent_bytes += len(packet) + 28  # with the headers of IP and UDP
         except (BlockingIOError, ConnectionRefusedError):
-            pass  # noqa: S110 - a lost packet: the link's timeout tells
+            pass
         except OSError as error:
-            raise ChannelError(f"{self._peer[0]}:{self._peer[1]}: cannot be sent to: {error.strerror or error}") from None
+            raise ChannelError(
+                f"{self._peer[0]}:{self._peer[1]}: cannot be sent to: {error.strerror or error}"
+            ) from None
 
     def receive(self) -> list[Message]:
         """All messages that have come since the last call, in order of arrival."""
@@ -484,7 +537,10 @@ class UdpChannel:
             self.received_bytes += len(packet) + 28
             before = self.sealer.refused["forged"] + self.sealer.refused["not ours"]
             message = self.sealer.open(packet, self._clock())
-            if self._peer is None and self.sealer.refused["forged"] + self.sealer.refused["not ours"] == before:
+            if (
+                self._peer is None
+                and self.sealer.refused["forged"] + self.sealer.refused["not ours"] == before
+            ):
                 self._peer = (str(sender[0]), int(sender[1]))
             if message is not None:
                 found.append(message)
@@ -501,5 +557,7 @@ class UdpChannel:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()

@@ -130,7 +130,8 @@ def _full(value: npt.ArrayLike, n: int, what: str) -> list[float]:
 
 
 class MasterSide(_Side):
-    """What the hand is made to feel: F = g F_env + K (x_s - x_m) + B (v_s - v_m) + holding, within its energy (docs/theory.md).
+    """What the hand is made to feel: F = g F_env + K (x_s - x_m) + B (v_s - v_m) + holding, within its energy
+    (docs/theory.md).
 
     Args:
         n: axes of the device, 1 to 16.
@@ -186,7 +187,9 @@ class MasterSide(_Side):
             "resync_rate": resync_rate,
         }
         try:
-            options = MasterOptions(passive=passive, fade=fade, **{k: _full(v, n, k) for k, v in vectors.items()})
+            options = MasterOptions(
+                passive=passive, fade=fade, **{k: _full(v, n, k) for k, v in vectors.items()}
+            )
             self._core = CoreMaster(n, options, coupling, link or LinkOptions(), tank or TankOptions())
         except ValueError as error:
             raise InputError(str(error)) from None
@@ -206,12 +209,15 @@ class MasterSide(_Side):
             hand: (n,) force of the hand on the device [N]; None: not known. four_channel tells it to the slave.
             closed: the clutch.
         """
-        force, felt, events, status = self._core.step(x, v, self._zeros if hand is None else hand, closed, dt, time_ns)
+        force, felt, events, status = self._core.step(
+            x, v, self._zeros if hand is None else hand, closed, dt, time_ns
+        )
         return MasterCommand(force, felt, Event(events), status)
 
 
 class SlaveSide(_Side):
-    """Where the slave is to go, and what is told of its touch; motion is limited, then bounded by energy (docs/theory.md).
+    """Where the slave is to go, and what is told of its touch; motion is limited, then bounded by energy
+    (docs/theory.md).
 
     Args:
         n: axes of the slave, 3 to 16 in task space, 1 to 16 joint to joint.
@@ -226,11 +232,13 @@ class SlaveSide(_Side):
         force_scale: force felt per force of the environment [1].
         threshold: below so many standard deviations nothing is felt [1].
         acceleration: of the reference at most [m/s^2].
-        resync: "index": after a pause the hand's new place counts as the slave's, nothing moves; "approach": the slave goes to the master's
+        resync: "index": after a pause the hand's new place counts as the slave's, nothing moves; "approach": the
+        slave goes to the master's
             place slowly (arms of one kinematics).
         resync_speed: [m/s].
         resync_acceleration: [m/s^2].
-        stiffness: K + 2 D/dt of spring and damper by which the slave follows, where the port's force is theirs; 0 where it is the
+        stiffness: K + 2 D/dt of spring and damper by which the slave follows, where the port's force is theirs; 0
+        where it is the
             environment's [N/m].
         wall: stiffness with which the end of the workspace is shown to the hand [N/m].
         gain: with which the reference closes on the master's place [1/s].
@@ -297,7 +305,13 @@ class SlaveSide(_Side):
                 **{k: _full(v, n, k) for k, v in vectors.items()},
             )
             self._core = CoreSlave(
-                n, options, coupling, resync, np.ascontiguousarray(R).ravel(), link or LinkOptions(), tank or TankOptions()
+                n,
+                options,
+                coupling,
+                resync,
+                np.ascontiguousarray(R).ravel(),
+                link or LinkOptions(),
+                tank or TankOptions(),
             )
         except ValueError as error:
             raise InputError(str(error)) from None
@@ -338,7 +352,8 @@ class SlaveSide(_Side):
 
 
 def felt_force(force: npt.ArrayLike, std: npt.ArrayLike, threshold: float = 3.0) -> Array:
-    """What a hand may be shown of an estimated force: nothing below `threshold` standard deviations, all of it from twice that on, smooth
+    """What a hand may be shown of an estimated force: nothing below `threshold` standard deviations, all of it
+    from twice that on, smooth
     between.
 
     Args:
@@ -348,6 +363,8 @@ def felt_force(force: npt.ArrayLike, std: npt.ArrayLike, threshold: float = 3.0)
     """
     F = np.ascontiguousarray(np.atleast_1d(force), dtype=np.float64)
     try:
-        return core_felt_force(F, np.ascontiguousarray(np.broadcast_to(std, F.shape), dtype=np.float64), float(threshold))
+        return core_felt_force(
+            F, np.ascontiguousarray(np.broadcast_to(std, F.shape), dtype=np.float64), float(threshold)
+        )
     except ValueError as error:
         raise InputError(str(error)) from None

@@ -1,4 +1,5 @@
-"""What a run shows: tracking, force felt against true, stiffness felt, how soon a touch is felt, jumps after a dead link."""
+"""What a run shows: tracking, force felt against true, stiffness felt, how soon a touch is felt, jumps after a
+dead link."""
 
 from __future__ import annotations
 
@@ -80,11 +81,14 @@ def transparency(run: Run, *, force_scale: float = 1.0, stiffness: float | None 
         first = rows[0]
         later = np.flatnonzero(np.abs(run.felt[first : first + 500]).max(axis=1) > 0.0)
         onset = float(later[0] * PERIOD) if len(later) else math.inf
-    return Transparency(tracking, free_force, force_error, held, felt_stiffness, met, onset, float(speed.max()))
+    return Transparency(
+        tracking, free_force, force_error, held, felt_stiffness, met, onset, float(speed.max())
+    )
 
 
 def jumps(run: Run, cuts: tuple[Cut, ...]) -> tuple[float, float, float]:
-    """After dead links, over half a second from each return: the largest change within 10 ms of the force of the device [N] and of the
+    """After dead links, over half a second from each return: the largest change within 10 ms of the force of the
+    device [N] and of the
     tool's velocity [m/s]; and how far the reference went while the link was dead [m]."""
     force = speed = moved = 0.0
     dead = (run.slave_events & int(Event.LINK)) != 0
@@ -99,5 +103,7 @@ def jumps(run: Run, cuts: tuple[Cut, ...]) -> tuple[float, float, float]:
             later = slice(begin + lag, begin + 500)
             before = slice(begin, begin + 500 - lag)
             force = max(force, float(np.abs(run.force[later] - run.force[before]).max(initial=0.0)))
-            speed = max(speed, float(np.abs(run.tip_velocity[later] - run.tip_velocity[before]).max(initial=0.0)))
+            speed = max(
+                speed, float(np.abs(run.tip_velocity[later] - run.tip_velocity[before]).max(initial=0.0))
+            )
     return force, speed, moved

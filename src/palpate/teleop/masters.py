@@ -22,7 +22,8 @@ def _nowhere(time: float) -> Array:
 class Hand:
     """An arm of a person, as it is felt at the hand: m x'' = K (x_i - x) - B x' + tremor + F.
 
-    Source: the second-order impedance of N. Hogan, IEEE TAC 29(8), 1984; figures of a relaxed to firm grip are 200 to 800 N/m and damping
+    Source: the second-order impedance of N. Hogan, IEEE TAC 29(8), 1984; figures of a relaxed to firm grip are 200
+    to 800 N/m and damping
     ratios of 0.2 to 0.6. Tremor: 8 to 12 Hz.
 
     Raises:
@@ -57,7 +58,8 @@ class Hand:
 class HapticDevice:
     """A simulated desktop device with three force axes, held by a :class:`Hand`.
 
-    Mass, largest force and resolution are those a maker publishes for the PHANTOM Premium 1.5: 75 g apparent mass, 8.5 N, 0.03 mm.
+    Mass, largest force and resolution are those a maker publishes for the PHANTOM Premium 1.5: 75 g apparent mass,
+    8.5 N, 0.03 mm.
     """
 
     hand: Hand
@@ -81,7 +83,9 @@ class HapticDevice:
         F = np.clip(force, -self.force_limit, self.force_limit)
         h, mass = dt / _SUBSTEPS, self.mass + self.hand.mass
         for _ in range(_SUBSTEPS):
-            self.v = self.v + (h / mass) * (F + self.hand.force(self.time, self.x, self.v) - self.friction * self.v)
+            self.v = self.v + (h / mass) * (
+                F + self.hand.force(self.time, self.x, self.v) - self.friction * self.v
+            )
             self.x = self.x + h * self.v
             self.time += h
 

@@ -79,14 +79,26 @@ def rows(run: Run, setup: Setup, cuts: tuple[Cut, ...] = ()) -> list[StudyRow]:
     every = [
         row("tool away from where the hand points, nothing touched, at most", 1e3 * t.tracking, "mm"),
         row("force of the device, nothing touched, at most", t.free_force, "N"),
-        row("force felt off the true one, mean", 100.0 * t.force_error, "%", f"while {t.force_held:.3g} N are held"),
+        row(
+            "force felt off the true one, mean",
+            100.0 * t.force_error,
+            "%",
+            f"while {t.force_held:.3g} N are held",
+        ),
         row("stiffness felt, part of what the tool meets", 100.0 * t.stiffness, "%"),
         row("felt after the touch", 1e3 * t.onset, "ms"),
         row("estimated against true force, mean", contact_error, "N"),
         row("largest true force", float(np.linalg.norm(run.true, axis=1).max(initial=0.0)), "N"),
     ]
     for time, true, mass, std in run.held:
-        every.append(row(f"object lifted at {time:.1f} s, of {true:g} kg: weighed", mass, "kg", f"± {1.96 * std:.3f} kg (95 %)"))
+        every.append(
+            row(
+                f"object lifted at {time:.1f} s, of {true:g} kg: weighed",
+                mass,
+                "kg",
+                f"± {1.96 * std:.3f} kg (95 %)",
+            )
+        )
     if cuts:
         force, speed, moved = jumps(run, cuts)
         every += [
@@ -97,13 +109,25 @@ def rows(run: Run, setup: Setup, cuts: tuple[Cut, ...] = ()) -> list[StudyRow]:
     for side, tank in run.tanks.items():
         every.append(row(f"{side}: energy taken less given at the port", tank["taken"] - tank["given"], "J"))
     every += [
-        row("bandwidth, to the slave and back", max(run.bandwidth) / 1e6, "Mbit/s", f"{run.bandwidth[0] / 1e6:.2f} and {run.bandwidth[1] / 1e6:.2f}"),
+        row(
+            "bandwidth, to the slave and back",
+            max(run.bandwidth) / 1e6,
+            "Mbit/s",
+            f"{run.bandwidth[0] / 1e6:.2f} and {run.bandwidth[1] / 1e6:.2f}",
+        ),
         row("round trip of the quickest message", 1e3 * run.round_trip, "ms"),
     ]
     return [r for r in every if r is not None]
 
 
-def write_report(run: Run, setup: Setup, path: str | PathLike[str], *, settings: dict[str, object], cuts: tuple[Cut, ...] = ()) -> Path:
+def write_report(
+    run: Run,
+    setup: Setup,
+    path: str | PathLike[str],
+    *,
+    settings: dict[str, object],
+    cuts: tuple[Cut, ...] = (),
+) -> Path:
     """Write a run as one self-contained HTML file, with its rows as Markdown and JSON beside it.
 
     Raises:
@@ -115,10 +139,12 @@ def write_report(run: Run, setup: Setup, path: str | PathLike[str], *, settings:
     forces = {"true": run.true, "estimated": run.estimated, "felt": run.felt / scale}
     places = {"where the hand points": run.wanted, "tool": run.tip}
     figures = {
-        "Force on the tool along the base's axes: true (MuJoCo), estimated without a force sensor, and felt by the hand": joints_figure(
+        "Force on the tool: true (MuJoCo), estimated without a force sensor, felt by the hand": joints_figure(
             run.time, forces, axes, quantity="force", unit="N"
         ),
-        "Where the hand points, and where the tool is": joints_figure(run.time, places, axes, quantity="place", unit="m"),
+        "Where the hand points, and where the tool is": joints_figure(
+            run.time, places, axes, quantity="place", unit="m"
+        ),
         "Energy in the tanks of the two sides": joints_figure(
             run.time, {"level": run.levels}, ("master", "slave"), quantity="energy", unit="J"
         ),
@@ -130,6 +156,12 @@ def write_report(run: Run, setup: Setup, path: str | PathLike[str], *, settings:
     told += [f"assumed: {sentence}" for sentence in setup.assumed]
     title = "Teleoperation" if setup.scene is None else f"Teleoperation: {setup.scene.text}"
     files = write_study(
-        rows(run, setup, cuts), figures, path, title=title, text="palpate teleop", settings=settings, provenance=told
+        rows(run, setup, cuts),
+        figures,
+        path,
+        title=title,
+        text="palpate teleop",
+        settings=settings,
+        provenance=told,
     )
     return files.html

@@ -73,7 +73,14 @@ def through(points: list[tuple[float, tuple[float, float, float]]]) -> Callable[
     return path
 
 
-def find(name: str, tip: Array, *, stiffness: float = 2000.0, press: float = 0.02, masses: tuple[float, ...] = (0.5, 1.2)) -> Scene:
+def find(
+    name: str,
+    tip: Array,
+    *,
+    stiffness: float = 2000.0,
+    press: float = 0.02,
+    masses: tuple[float, ...] = (0.5, 1.2),
+) -> Scene:
     """The scene of that name, placed for a tool whose tip is at `tip` (3,) [m] in the slave's base frame.
 
     Args:
@@ -95,7 +102,9 @@ def find(name: str, tip: Array, *, stiffness: float = 2000.0, press: float = 0.0
     if name not in makers:
         raise InputError(f"no scene {name!r}; {suggest(str(name), makers, 'there are')}")
     if not (10.0 <= stiffness <= 1e6 and 0.0 < press <= 0.2):
-        raise InputError(f"stiffness must be 10 to 1e6 N/m and press above 0 to 0.2 m, got {stiffness!r} and {press!r}")
+        raise InputError(
+            f"stiffness must be 10 to 1e6 N/m and press above 0 to 0.2 m, got {stiffness!r} and {press!r}"
+        )
     return makers[name]()
 
 
@@ -121,7 +130,9 @@ def _wall(tip: Array, stiffness: float, press: float) -> Scene:
         )
 
     deep = gap + press
-    path = through([(2.0, (0.0, 0.0, 0.0)), (3.5, (deep, 0.0, 0.0)), (6.5, (deep, 0.0, 0.0)), (8.5, (0.0, 0.0, 0.0))])
+    path = through(
+        [(2.0, (0.0, 0.0, 0.0)), (3.5, (deep, 0.0, 0.0)), (6.5, (deep, 0.0, 0.0)), (8.5, (0.0, 0.0, 0.0))]
+    )
     text = f"press a wall on a spring of {stiffness:g} N/m, {1e3 * press:g} mm deep, and come back"
     return Scene("wall", text, build, 1, stiffness, path, 9.5)
 
@@ -158,7 +169,15 @@ def _surface(tip: Array, press: float) -> Scene:
             (12.5, (0.0, 0.1, 0.0)),
         ]
     )
-    return Scene("surface", f"trace a surface that falls by {np.degrees(slope):.0f} degrees, pressing lightly", build, 0, None, path, 13.5)
+    return Scene(
+        "surface",
+        f"trace a surface that falls by {np.degrees(slope):.0f} degrees, pressing lightly",
+        build,
+        0,
+        None,
+        path,
+        13.5,
+    )
 
 
 def _peg(tip: Array) -> Scene:
@@ -192,7 +211,15 @@ def _peg(tip: Array) -> Scene:
             (13.0, (0.0, 0.0, 0.0)),
         ]
     )
-    return Scene("peg", f"put a peg into a hole {1e3 * PEG_GAP:g} mm wider on each side, missing it at first", build, 0, None, path, 14.0)
+    return Scene(
+        "peg",
+        f"put a peg into a hole {1e3 * PEG_GAP:g} mm wider on each side, missing it at first",
+        build,
+        0,
+        None,
+        path,
+        14.0,
+    )
 
 
 def _lift(masses: tuple[float, ...]) -> Scene:
@@ -203,9 +230,23 @@ def _lift(masses: tuple[float, ...]) -> Scene:
     time = 2.0
     for mass in masses:
         events += [(time + 1.0, mass), (time + 7.0, 0.0)]
-        points += [(time + 1.5, (0.0, 0.0, 0.0)), (time + 3.0, (0.0, 0.0, 0.1)), (time + 5.0, (0.0, 0.1, 0.1)), (time + 6.5, (0.0, 0.0, 0.0))]
+        points += [
+            (time + 1.5, (0.0, 0.0, 0.0)),
+            (time + 3.0, (0.0, 0.0, 0.1)),
+            (time + 5.0, (0.0, 0.1, 0.1)),
+            (time + 6.5, (0.0, 0.0, 0.0)),
+        ]
         time += 8.0
-    return Scene("lift", f"lift {len(masses)} objects whose masses nobody knows, and weigh them", None, 0, None, through(points), time + 1.0, tuple(events))
+    return Scene(
+        "lift",
+        f"lift {len(masses)} objects whose masses nobody knows, and weigh them",
+        None,
+        0,
+        None,
+        through(points),
+        time + 1.0,
+        tuple(events),
+    )
 
 
 # --- arms with a tool -------------------------------------------------------------------------------------------------
@@ -255,5 +296,8 @@ def slave_arm(name: str) -> SlaveArm:
         arm,
         np.array(_POSES[name]),
         1.0,
-        ("encoders of 1 microradian, velocities with 0.1 mrad/s and torques with 0.05 N m of noise at 1 kHz: no source states them",),
+        (
+            "encoders of 1 microradian, velocities with 0.1 mrad/s and torques with 0.05 N m of noise at 1 kHz: "
+            "no source states them",
+        ),
     )

@@ -1,4 +1,5 @@
-"""A teleoperator in one process, period by period: hand, device, both sides, the packets between them, the slave, what really happened."""
+"""A teleoperator in one process, period by period: hand, device, both sides, the packets between them, the slave,
+what really happened."""
 
 from __future__ import annotations
 
@@ -121,7 +122,8 @@ def run(
     stop: Callable[[], bool] = lambda: False,
     seed: int = 0,
 ) -> Run:
-    """Run both sides in lock-step over a line with faults; every message goes through the encrypted packets of the channel.
+    """Run both sides in lock-step over a line with faults; every message goes through the encrypted packets of the
+    channel.
 
     Args:
         device: held by its hand.
@@ -164,7 +166,9 @@ def run(
             if (answer := boxes["master"].open(packet, now)) is not None:
                 master_side.receive(answer)
         x, v = device.read()
-        command = master_side.step(x, v, PERIOD, now, hand=-out.force[k - 1] if k else None, closed=closed(time))
+        command = master_side.step(
+            x, v, PERIOD, now, hand=-out.force[k - 1] if k else None, closed=closed(time)
+        )
         packet = boxes["master"].seal(master_side.message(), now)
         sent[0] += len(packet) + 28
         there.send(packet, now)
@@ -203,7 +207,9 @@ def run(
         out.master_events[k], out.slave_events[k] = command.events, reference.events
         out.q[k], out.effort[k] = seen.q, slave.driver.plant.torque
         out.levels[k] = master_side.tank()["level"], slave_side.tank()["level"]
-        now_reason = seen.reason or ("end of the slave's workspace" if reference.events & Event.WORKSPACE else "")
+        now_reason = seen.reason or (
+            "end of the slave's workspace" if reference.events & Event.WORKSPACE else ""
+        )
         silent = bool((command.events | reference.events) & Event.LINK)
         heard = heard or not silent
         now_reason = "the link is dead: both hold" if heard and silent else now_reason

@@ -16,7 +16,8 @@ from .session import Cut, Progress, Run, run
 from .slaves import SimulatedSlave
 
 TANK = {"initial": 0.05, "desired": 0.1, "most": 0.5}
-"""of both sides [J]: what a hand gives that presses 5 N over 2 cm; without an initial charge the first touch finds nothing to pay with"""
+"""of both sides [J]: what a hand gives that presses 5 N over 2 cm; without an initial charge the first touch finds
+nothing to pay with"""
 CONTACT_DAMPING = 30.0
 """of the device in contact [N s/m]: it makes up for the estimate's 6 ms and the line's 1 ms"""
 THRESHOLD = 5.0

@@ -1,4 +1,5 @@
-"""Slaves: an arm behind the driver contract that follows a reference and tells what touches it, without a force sensor."""
+"""Slaves: an arm behind the driver contract that follows a reference and tells what touches it, without a force
+sensor."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ OBSERVER = 180.0
 _SINGULAR = 0.08
 """least singular value of the Jacobian's translation below which the arm slows down [m]"""
 STIFFENING = 40.0
-"""bandwidth with which the external torque is taken off [rad/s]: well below the observer's, which is half a period late"""
+"""bandwidth with which the external torque is taken off [rad/s]: well below the observer's, which is half a period
+late"""
 _JERKY = 20.0
 """acceleration of a joint's reference at most [rad/s^2]"""
 _SETTLE = 0.4
@@ -61,12 +63,15 @@ class Seen:
 class ArmSlave:
     """Follows a reference of its tool's tip, keeping the tool's orientation, and estimates what touches it.
 
-    Resolved rates with damping near singular poses give joint references; each joint follows by computed torque, and the estimated external
-    torque is taken off (a disturbance observer), so that what touches the tool does not push it away from its reference::
+    Resolved rates with damping near singular poses give joint references; each joint follows by computed torque,
+    and the estimated external
+    torque is taken off (a disturbance observer), so that what touches the tool does not push it away from its
+    reference::
 
         u = M(q) (q_r'' + w^2 (q_r - q) + 2 w (q_r' - q')) + C q' + g + tau_f - tau_ext
 
-    The force told is that of the pipeline: weight and inertia of what is held are taken away, and so is what is felt at rest before the start.
+    The force told is that of the pipeline: weight and inertia of what is held are taken away, and so is what is
+    felt at rest before the start.
 
     Args:
         driver: the arm; connected and enabled here.
@@ -114,7 +119,8 @@ class ArmSlave:
         )
 
     def hold(self, mass: float) -> None:
-        """From now on this mass in the hand is known [kg]: its weight and inertia are not felt. The estimate starts anew."""
+        """From now on this mass in the hand is known [kg]: its weight and inertia are not felt. The estimate
+        starts anew."""
         self._pipeline = self._made(mass)
         self._touch = self._pipeline.step(self._sample)
 
@@ -136,8 +142,14 @@ class ArmSlave:
         _, tip, J = self._pose(q)
         wrench = touch.wrench
         assert wrench is not None
-        good = wrench.status in (Status.ok, Status.saturated, Status.singular) and bool(np.isfinite(wrench.force).all())
-        force, std = (np.array(wrench.force), np.array(wrench.force_std)) if good else (np.zeros(3), np.full(3, np.inf))
+        good = wrench.status in (Status.ok, Status.saturated, Status.singular) and bool(
+            np.isfinite(wrench.force).all()
+        )
+        force, std = (
+            (np.array(wrench.force), np.array(wrench.force_std))
+            if good
+            else (np.zeros(3), np.full(3, np.inf))
+        )
         if self._tare is None:
             if good:
                 self._rest.append(force)
@@ -172,7 +184,8 @@ class ArmSlave:
         return self.seen
 
     def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:
-        """Send the torque that takes the tool's tip to `x_ref` (3,) [m] at `v_ref` (3,) [m/s]; `push` (3,) [N] beside it.
+        """Send the torque that takes the tool's tip to `x_ref` (3,) [m] at `v_ref` (3,) [m/s]; `push` (3,) [N]
+        beside it.
 
         Returns:
             (n,) torque sent [N m]; zeros if the drives are off.
@@ -184,7 +197,9 @@ class ArmSlave:
         task = np.concatenate((v_ref + 100.0 * (x_ref - tip), 50.0 * angle))
         U, s, Vt = np.linalg.svd(J, full_matrices=True)
         damp = 0.0 if s[-1] >= _SINGULAR else 0.02 * (1.0 - (s[-1] / _SINGULAR) ** 2)
-        self._reason = "" if s[-1] >= _SINGULAR else f"slave near a singular pose (least singular value {s[-1]:.3f})"
+        self._reason = (
+            "" if s[-1] >= _SINGULAR else f"slave near a singular pose (least singular value {s[-1]:.3f})"
+        )
         rates = Vt[: len(s)].T @ (s / (s * s + damp) * (U.T @ task))
         if n > 6:
             spare = Vt[6:]
@@ -205,7 +220,9 @@ class ArmSlave:
         a = ddq_ref + BANDWIDTH**2 * (self._q_ref - seen.q) + 2.0 * BANDWIDTH * (rates - seen.dq)
         torque = self.model.inverse_dynamics(seen.q, seen.dq, a) + self.model.friction_torque(seen.dq)
         if external.status == Status.ok:
-            self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (external.torque - self._taken_off)
+            self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (
+                external.torque - self._taken_off
+            )
         torque = torque - self._taken_off
         if push is not None:
             torque = torque + J[:3].T @ push
@@ -237,7 +254,9 @@ class SimulatedSlave(ArmSlave):
         MissingExtraError: mujoco is not installed.
     """
 
-    def __init__(self, arm: Arm, q: Array, scene: Scene | None = None, *, model: Arm | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, arm: Arm, q: Array, scene: Scene | None = None, *, model: Arm | None = None, seed: int = 0
+    ) -> None:
         if np.shape(q) != (arm.n,):
             raise InputError(f"q: expected {arm.n} angles, got {np.shape(q)}")
         build = None if scene is None else scene.build
@@ -289,4 +308,6 @@ def _of_arm(model: Any, geom: int) -> bool:
 def reach(arm: Arm) -> float:
     """How far the tool's tip can be from the base, at most [m]."""
     lengths = [float(np.linalg.norm(j.T_parent_joint[:3, 3])) for j in arm.joints]
-    return math.fsum(lengths) + float(np.linalg.norm(arm.T_last_tip[:3, 3])) + float(np.linalg.norm(arm.grasp))
+    return (
+        math.fsum(lengths) + float(np.linalg.norm(arm.T_last_tip[:3, 3])) + float(np.linalg.norm(arm.grasp))
+    )
