@@ -35,6 +35,7 @@ VERBS = (
     "data",
     "see",
     "ros",
+    "wipe",
 )
 
 

@@ -53,7 +53,12 @@ def test_there_are_examples_and_each_is_short():
         assert promised(script), f"{script.name}: the docstring does not say what it prints"
 
 
-@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
+def quick_or_slow(script: Path):
+    slow = "Takes about half a minute" in script.read_text(encoding="utf-8")
+    return pytest.param(script, id=script.stem, marks=pytest.mark.slow if slow else ())
+
+
+@pytest.mark.parametrize("script", map(quick_or_slow, EXAMPLES))
 def test_example(script, tmp_path):
     source = script.read_text(encoding="utf-8")
     needed = re.search(r"[Nn]eeds\s+palpate\[([a-z,]+)\]", source)

@@ -23,6 +23,8 @@ Picture = npt.NDArray[np.uint8]
 WIDTH, HEIGHT = 1280, 720
 RATE = 10.0
 """pictures per simulated second"""
+CAMERA = (400, 225)
+"""width and height of the camera's picture [pixel]"""
 WINDOW = 12.0
 """the force is shown over so long [s]"""
 _PAPER, _INK, _MUTED, _GRID = (250, 250, 250), (40, 36, 32), (130, 124, 118), (225, 222, 218)
@@ -78,7 +80,10 @@ class Film(Observer):
 
     def look(self, look: Look) -> None:
         """Keep the picture with what was seen in it."""
-        self._camera = annotated(look.image, look.sight)
+        whole = annotated(look.image, look.sight)
+        if look.sight.board is not None:
+            whole = _cut(whole, look.sight.board.corners)
+        self._camera = cv2.resize(whole, CAMERA, interpolation=cv2.INTER_AREA)
 
     def event(self, event: Event) -> None:
         """Keep the line."""
@@ -109,9 +114,7 @@ class Film(Observer):
             cv2.rectangle(page, (864, 18), (864 + round(399 * done), 32), _BLUE, -1)
         _text(page, "what the camera saw last, ink marked", (864, 64), _MUTED, 0.45)
         if self._camera is not None:
-            page[72 : 72 + 225, 864 : 864 + 400] = cv2.resize(
-                self._camera, (400, 225), interpolation=cv2.INTER_AREA
-            )
+            page[72 : 72 + CAMERA[1], 864 : 864 + CAMERA[0]] = self._camera
         _text(page, "the board now, and where the eraser slid", (864, 320), _MUTED, 0.45)
         self._board(page[328:516, 864:1264])
         self._forces(page[528:700, 16:1264])
@@ -159,6 +162,19 @@ class Film(Observer):
             for a, b in zip(breaks, ends, strict=True):
                 line = np.stack([x[a : b + 1], y(rows[a : b + 1, column])], 1)
                 cv2.polylines(part, [np.rint(line).astype(np.int32)], False, colour, 1, cv2.LINE_AA)
+
+
+def _cut(picture: Picture, corners: npt.NDArray[np.float64]) -> Picture:
+    """What is around a board, in the shape of CAMERA."""
+    h, w = picture.shape[:2]
+    extent = 1.5 * np.ptp(corners, axis=0)
+    height = min(
+        max(float(extent[1]), float(extent[0]) * CAMERA[1] / CAMERA[0]), h, w * CAMERA[1] / CAMERA[0]
+    )
+    size = np.array([height * CAMERA[0] / CAMERA[1], height])
+    low = np.clip(corners.mean(0) - 0.5 * size, 0.0, np.maximum([w, h] - size, 0.0)).astype(int)
+    high = low + np.maximum(size.astype(int), 1)
+    return picture[low[1] : high[1], low[0] : high[0]]
 
 
 def _text(page: Picture, words: str, at: tuple[int, int], colour: tuple[int, int, int], size: float) -> None:

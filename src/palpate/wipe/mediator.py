@@ -146,7 +146,6 @@ class Others:
         return float(np.linalg.norm(board.corners - self.outline(plane.T_base_board), axis=1).max()) < SHAPE
 
 
-
 def displacement(reference: Look, now: Look) -> float | None:
     """How far a board has moved between two pictures, an arm in front of the second [m]; None: too much is hidden.
 

@@ -486,8 +486,8 @@ class BoardScene:
         if self._aside is None:
             aside = self._mj.MjvCamera()
             aside.type = self._mj.mjtCamera.mjCAMERA_FREE
-            aside.lookat[:] = (0.78, 0.0, 0.42)
-            aside.azimuth, aside.elevation, aside.distance = 118.0, -24.0, 2.15
+            aside.lookat[:] = (0.76, 0.0, 0.36)
+            aside.azimuth, aside.elevation, aside.distance = 118.0, -26.0, 1.8
             self._aside = _Lens(self._plant.model, width, height, aside)
         return self._shown(self._aside).copy()
 
