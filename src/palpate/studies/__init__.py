@@ -140,6 +140,12 @@ _ALL = (
         "board-detection", "Whiteboards found in rendered views and photographs, and the ink on them", "bench"
     ),
     Study("session", "The real-time session at 1 kHz while the computer is busy", "bench", timed=True),
+    Study(
+        "wipe",
+        "Fifty boards wiped, from camera pixels to a clean board, without a force sensor",
+        "bench",
+        campaign=True,
+    ),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
 

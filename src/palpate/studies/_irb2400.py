@@ -264,9 +264,7 @@ STEP = 0.03
 """how far to either side a static pose is approached from [rad]"""
 
 
-def static_poses(
-    seed: int, count: int
-) -> tuple[Callable[[Array], Array], list[tuple[float, float]], float]:
+def static_poses(seed: int, count: int) -> tuple[Callable[[Array], Array], list[tuple[float, float]], float]:
     """Poses held after an approach from below, then from above: motion, (time, side) of each hold, length [s]."""
     rng = np.random.default_rng(seed)
     targets = poses().mean(axis=0) + np.array([0.5, 0.35, 0.3, 1.2, 0.8, 1.2]) * rng.uniform(

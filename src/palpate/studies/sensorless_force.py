@@ -109,7 +109,10 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     for k, number in enumerate(fresh, 1):
         other = experiment(replace(plan, changes=()), lambda done, k=k: part(k, done), number)  # type: ignore[misc]
         others.append(
-            [score([(estimate(other, m, moment), late(m.wrench)) for m in other.records]) for moment in MOMENTS]
+            [
+                score([(estimate(other, m, moment), late(m.wrench)) for m in other.records])
+                for moment in MOMENTS
+            ]
         )
     progress(101, 101, 0.0)
     return (

@@ -184,7 +184,9 @@ class WipeJob:
             scene.camera,
             scene.ink.size,
         )
-        mediator = Mediator(p["mediator"], o, others, self._tell, self._pass, self._number, self._open is not None)
+        mediator = Mediator(
+            p["mediator"], o, others, self._tell, self._pass, self._number, self._open is not None
+        )
         self._mediator = mediator
         for activity in (perception, navigation, mediator, estimation, control, robot):
             activity.told = lambda name, state: self._tell("activity", f"{name} is {state}")
