@@ -156,6 +156,12 @@ _ALL = (
     ),
     Study("rtde", "An emulated UR at 500 Hz: age of the samples, a cut connection", "bench", timed=True),
     Study("fri", "An emulated KUKA LBR at 2 ms: the session holds, no stale command", "bench", timed=True),
+    Study(
+        "wipe",
+        "Fifty boards wiped, from camera pixels to a clean board, without a force sensor",
+        "bench",
+        campaign=True,
+    ),
     Study("speed", "Time per sample, beside the same written with Pinocchio", "bench"),
 )
 

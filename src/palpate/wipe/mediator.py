@@ -215,7 +215,7 @@ class Mediator(Activity):
         self._asked = False
         self._paths: deque[tuple[int, Path]] = deque()
         self._law: tuple[int, Law] | None = None
-        self._tries = self._grips = self._again = 0
+        self._tries = self._grips = self._again = self._doubts = 0
         self._choice: Choice | None = None
         self._reference: Look
         self._hand: Array | None = None
@@ -520,6 +520,9 @@ class Mediator(Activity):
         if away is not None and away > MOVED:
             self._halt("hand", f"the board moved by {1e3 * away:.0f} mm under the eraser")
             self._loose = False
+        elif away is None and self._doubts < LOOKS:
+            self._doubts += 1
+            self._halt("hand", "too little of the board is seen where it was")
 
     def _safe(self) -> None:
         waited = self._now - self._since
