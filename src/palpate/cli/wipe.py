@@ -179,7 +179,11 @@ def run(
     if report or record:
         make_folder(out)
     if report:
+        from ..report._style import drawing
+
         check_target(page, is_report, "the report")
+        with drawing():  # what it needs is missed now, not when all is done
+            pass
     if record:
         check_target(recording, is_recording, "the recording")
     if video is not None:
