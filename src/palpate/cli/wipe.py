@@ -179,7 +179,11 @@ def run(
     if report or record:
         make_folder(out)
     if report:
+        from ..report._style import drawing
+
         check_target(page, is_report, "the report")
+        with drawing():  # what it needs is missed now, not when all is done
+            pass
     if record:
         check_target(recording, is_recording, "the recording")
     if video is not None:
@@ -267,10 +271,12 @@ def _board(
             layer.picture(load(picture)[..., ::-1])
         elif lines:
             w, h = layer.size
-            height = min(0.6 * h / (len(lines) + 1), 0.12 * h)
             colours = ("black", "blue", "red", "green")
             for k, words in enumerate(lines):
-                at = (0.06 * w, (k + 1) * h / (len(lines) + 1) + 0.5 * height)
+                # letters are about 0.7 times as wide as they are high
+                broad = 0.7 * max(len(words), 1)
+                height = min(0.5 * h / (len(lines) + 1), 0.2 * h, 0.88 * w / broad)
+                at = (0.5 * (w - broad * height), (k + 1) * h / (len(lines) + 1) + 0.5 * height)
                 layer.text(words, at, height=height, colour=colours[k % len(colours)])
         else:
             wiping.handwriting(layer, seed)

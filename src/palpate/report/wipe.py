@@ -307,7 +307,7 @@ def coverage_map(report: WipeReport) -> Figure:
     image = ax.imshow(
         work,
         extent=(0.0, w, h, 0.0),
-        cmap="YlGnBu",
+        cmap="Blues",
         vmin=0.0,
         vmax=top,
         aspect="auto",

@@ -1,4 +1,4 @@
-"""Wiping a whiteboard: where to go with the eraser, and what that does to the ink. Needs ``palpate[wipe]``.
+"""Wiping a whiteboard: seeing, holding, wiping, checking, and a world to try it in. Needs ``palpate[wipe]``.
 
 >>> from palpate import vision, wipe
 >>> sight = vision.see(vision.load("photo.jpg"), size=(0.90, 0.60))  # doctest: +SKIP
@@ -11,6 +11,7 @@ try:
     import cv2 as _cv2  # noqa: F401  the rest of the package needs these
     import scipy as _scipy  # noqa: F401
     import shapely as _shapely  # noqa: F401
+    import statemachine as _statemachine  # noqa: F401
 except ImportError:
     from ..errors import MissingExtraError
 

@@ -82,7 +82,7 @@ class Film(Observer):
         """Keep the picture with what was seen in it."""
         whole = annotated(look.image, look.sight)
         if look.sight.board is not None:
-            whole = _cut(whole, look.sight.board.corners)
+            whole = around(whole, look.sight.board.corners)
         self._camera = cv2.resize(whole, CAMERA, interpolation=cv2.INTER_AREA)
 
     def event(self, event: Event) -> None:
@@ -92,9 +92,9 @@ class Film(Observer):
 
     def tick(self, tick: Tick) -> None:
         """Draw, if it is time."""
-        self._force.append(
-            (tick.time_ns * 1e-9, tick.wanted_force or math.nan, tick.normal_force, tick.true_normal)
-        )
+        wanted = tick.wanted_force or math.nan
+        felt = tick.normal_force if wanted == wanted else math.nan  # in the air it means nothing
+        self._force.append((tick.time_ns * 1e-9, wanted, felt, tick.true_normal))
         if tick.phase == "slide" and tick.time_ns % 40_000_000 == 0:
             at = np.linalg.inv(tick.T_world_board) @ tick.T_world_tool[:, 3]
             self._path.append((float(at[0]), float(at[1])))
@@ -164,8 +164,8 @@ class Film(Observer):
                 cv2.polylines(part, [np.rint(line).astype(np.int32)], False, colour, 1, cv2.LINE_AA)
 
 
-def _cut(picture: Picture, corners: npt.NDArray[np.float64]) -> Picture:
-    """What is around a board, in the shape of CAMERA."""
+def around(picture: Picture, corners: npt.NDArray[np.float64]) -> Picture:
+    """The part of a picture around a board, in the shape of CAMERA."""
     h, w = picture.shape[:2]
     extent = 1.5 * np.ptp(corners, axis=0)
     height = min(

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..report import WipeReport
 from ..vision import annotated
+from .film import around
 from .options import JobOptions
 from .result import JobResult, Look
 from .scene import BoardScene
@@ -18,7 +19,7 @@ BAND = 0.5, 1.0
 """half width within which the normal force should stay [N]: up to SLOW, and above"""
 SLOW = 0.15
 """[m/s]"""
-_SHOWN = 960
+_SHOWN = 720
 """width of a picture in the report [pixels]"""
 
 
@@ -132,6 +133,8 @@ def _jpeg(look: Look | None) -> bytes | None:
     if look is None:
         return None
     picture = annotated(look.image, look.sight)
+    if look.sight.board is not None:
+        picture = around(picture, look.sight.board.corners)
     scale = _SHOWN / picture.shape[1]
     if scale < 1.0:
         size = (_SHOWN, round(scale * picture.shape[0]))
@@ -140,7 +143,7 @@ def _jpeg(look: Look | None) -> bytes | None:
 
 
 def _milli(seconds: float) -> str:
-    return f"{1e3 * seconds:.3g} ms"
+    return f"{1e3 * seconds:.0f} ms" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"
 
 
 def _largest(values: np.ndarray) -> float | None:
