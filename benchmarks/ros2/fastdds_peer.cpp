@@ -132,14 +132,18 @@ int main(int argc, char** argv) {
   fast::DataWriterQos writing = fast::DATAWRITER_QOS_DEFAULT;
   writing.reliability().kind = mode == "robot" ? fast::BEST_EFFORT_RELIABILITY_QOS : fast::RELIABLE_RELIABILITY_QOS;
   writing.history().kind = fast::KEEP_LAST_HISTORY_QOS;
-  writing.history().depth = 1000;
+  writing.history().depth = 10'000;
+  writing.resource_limits().max_samples = 20'000;
+  writing.resource_limits().max_samples_per_instance = 10'000;
   writing.endpoint().history_memory_policy = rtps::DYNAMIC_RESERVE_MEMORY_MODE;
   // what is larger than a datagram must be sent by another thread
   writing.publish_mode().kind = mode == "giant" ? fast::ASYNCHRONOUS_PUBLISH_MODE : fast::SYNCHRONOUS_PUBLISH_MODE;
   fast::DataReaderQos reading = fast::DATAREADER_QOS_DEFAULT;
   reading.reliability().kind = fast::RELIABLE_RELIABILITY_QOS;
   reading.history().kind = fast::KEEP_LAST_HISTORY_QOS;
-  reading.history().depth = 1000;
+  reading.history().depth = 10'000;
+  reading.resource_limits().max_samples = 20'000;
+  reading.resource_limits().max_samples_per_instance = 10'000;
   reading.endpoint().history_memory_policy = rtps::DYNAMIC_RESERVE_MEMORY_MODE;
 
   const std::string out_name = "rt" + topic + (mode == "echo" ? "_echo" : "");

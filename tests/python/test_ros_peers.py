@@ -126,7 +126,16 @@ class TestFastDds:
             said.open("w") as output,
         ):
             me.subscribe(InertiaStamped, f"{TOPIC}/payload", lambda m, w: answers.append(m))
-            options = ["--domain", str(DOMAIN), "--localhost", "--ros-args", "-p", "arm:=kuka_lbr_iiwa7"]
+            options = [
+                "--domain",
+                str(DOMAIN),
+                "--localhost",
+                "--ros-args",
+                "-p",
+                "arm:=kuka_lbr_iiwa7",
+                "-p",
+                "assume:=true",
+            ]
             remaps = ["-r", f"joint_states:={TOPIC}", "-r", f"payload:={TOPIC}/payload"]
             node = palpate_ros("run", "mass", *options, *remaps, stdout=output)
             try:

@@ -24,7 +24,7 @@ from ..errors import InputError
 from .messages import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo
 from .names import plain_type
 
-LARGEST = 256
+LARGEST = 64
 """messages larger than this are dropped before they are put together [kB]"""
 
 

@@ -22,6 +22,8 @@ from .node import Node, Publisher
 from .source import Kind, SampleSource, Stamp
 
 CommandKind: TypeAlias = Literal["float64_multi_array", "joint_state"]
+_FAREWELL = 0.2
+"""for the last command to arrive [s]"""
 _BACKLOG = 10_000
 """samples that wait to be read, at most"""
 
@@ -209,8 +211,10 @@ class RosDriver(Driver):
 
     def _disable(self) -> None:
         if self._commanded:
+            assert self._commands is not None  # there were commands
             self._commanded = False
             self._publish(np.zeros(self.n), ())
+            self._commands.flush(_FAREWELL)  # closing at once would take it back
 
     def _close(self) -> None:
         if self._node is not None:

@@ -41,8 +41,8 @@ def graph(name: str, without: Sequence[str] = ()) -> tuple[str, ...]:
 class Launch:
     """Processes of nodes, each ``palpate ros run NODE``.
 
-    Where the simulated arm is among them, the others wait for nothing and it waits for them; when it has done its
-    ``duration``, all are stopped.
+    Where the simulated arm is among them, it waits for the others, and all take what its description leaves open as it
+    does; when it has done its ``duration``, all are stopped.
 
     Args:
         nodes: names of tasks.
@@ -79,10 +79,12 @@ class Launch:
 
     def _start(self, name: str) -> None:
         arguments = list(self._arguments)
-        if name == "arm_simulation":
+        if "arm_simulation" in self.nodes:
             readers = sum(TASKS[node].reads_samples for node in self.nodes)
-            # in front: what the user says of it wins
-            arguments = ["--ros-args", "-p", f"arm_simulation:wait_for:={readers}", "--", *arguments]
+            own = ["-p", "assume:=true"] + (
+                ["-p", f"wait_for:={readers}"] if name == "arm_simulation" else []
+            )
+            arguments = ["--ros-args", *own, "--", *arguments]  # in front: what the user says wins
         command = [sys.executable, "-m", "palpate.cli", "ros", "run", name]
         command += [*self._options, "--parent", str(os.getpid()), *arguments]
         self._starts[name].append(time.monotonic())

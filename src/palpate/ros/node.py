@@ -34,6 +34,8 @@ _ALONE = 5.0
 """how long nobody may publish what a node reads until it says so [s]"""
 _DIAGNOSTICS = 1.0
 """[s]"""
+_COMPLAINT = 10.0
+"""how long messages that are none are spoken of after the last of them [s]"""
 _TAKEN = 200
 """messages taken from a reader at a time"""
 _LEVELS = ("ok", "warning", "error")
@@ -64,6 +66,10 @@ class Publisher:
         except Exception as error:  # noqa: BLE001 cyclonedds raises bare ones
             raise InputError(f"{self.name}: {' '.join(str(error).split())[:200]}") from None
 
+    def flush(self, timeout: float) -> bool:
+        """Wait until every reliable reader has what was sent, at most `timeout` [s]; whether they have."""
+        return bool(self._writer.wait_for_acks(duration(seconds=timeout)))
+
     def close(self) -> None:
         """Publish no more; readers are told at once, whoever still holds this."""
         self._writer = None
@@ -91,10 +97,9 @@ class Subscription:
         self.message = message
         self.malformed = 0
         """messages whose bytes were not of this type"""
-        self.reason = ""
-        """what was wrong with the last of them"""
         self._context, self._how, self._attach = context, how, attach
         self._callback = callback
+        self._malformed, self._complain_until, self._reason = 0, 0.0, ""
         self._open()
 
     def _open(self) -> None:
@@ -109,7 +114,7 @@ class Subscription:
         for message in self._reader.take(_TAKEN):
             if isinstance(message, Malformed):
                 self.malformed += 1
-                self.reason = message.reason
+                self._reason = self._reason or message.reason
             elif isinstance(message, self.message):
                 count += 1
                 handle = message.sample_info.publication_handle & 0xFFFF_FFFF_FFFF_FFFF
@@ -131,9 +136,15 @@ class Subscription:
 
     def look(self) -> str:
         """Take what is offered; what keeps messages away, in one line, or nothing."""
+        now = time.monotonic()
+        if self.malformed > self._malformed:
+            self._malformed = self.malformed
+            self._complain_until = now + _COMPLAINT
         if self._reader.get_matched_publications():
-            self._since = time.monotonic()
-            return f"{self.malformed} messages were not {self._type}: {self.reason}" if self.malformed else ""
+            self._since = now
+            if now >= self._complain_until:
+                self._reason = ""
+            return self._reason and f"{self.name}: some messages are not {self._type}: {self._reason}"
         known = self.publishers()
         others = sorted({p.type for p in known if p.type != self._type})
         if self._how.reliable and any(p.type == self._type and not p.reliable for p in known):

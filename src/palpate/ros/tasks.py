@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from .._core import Status, WrenchEstimator
-from ..arm import Arm, Array
+from ..arm import Arm, Array, Sensing
 from ..control import Controller, Quintic, SafetyLimiter, Setpoint
 from ..drivers.mujoco import MujocoDriver
 from ..errors import InputError
@@ -71,6 +71,8 @@ class TaskNode(Node):
     """what it does, one line"""
     reads_samples = False
     """whether it reads joint_states"""
+    simulated = False
+    """whether the arm is"""
 
     def __init__(
         self, context: Context, arguments: RosArguments | None = None, *, quiet: bool = False
@@ -85,11 +87,18 @@ class TaskNode(Node):
             "what efforts are, where the card does not say: torque, or current:GAIN,...",
             fixed=True,
         )
+        assume: bool = self._declare(
+            "assume",
+            self.simulated,
+            "what the arm's description leaves open is taken as in simulation, and said",
+            fixed=True,
+        )
         arm = load_arm(self.arm_name)
-        self.scene: Scene = scene(arm.replace(effort=parse_effort(effort)) if effort else arm)
-        for sentence in self.scene.assumed:
+        arm = arm.replace(effort=parse_effort(effort)) if effort else arm
+        self.scene: Scene = scene(arm)
+        self.arm: Arm = self.scene.arm if assume else arm
+        for sentence in self.scene.assumed if assume else ():
             self.log(sentence)
-        self.arm: Arm = self.scene.arm
         self.finished = False
         self._prepare()
         for remark in self.parameters.check_overrides():
@@ -151,6 +160,7 @@ class ArmSimulation(TaskNode):
 
     task = "arm_simulation"
     about = "a simulated arm with noise: joint_states out, torque in by joint_commands"
+    simulated = True
 
     def _prepare(self) -> None:
         declare = self._declare
@@ -456,6 +466,12 @@ class Estimator(TaskNode):
     payload: str | None = None
 
     def _prepare(self) -> None:
+        silent = [j.name for j in self.arm.joints if j.sensing == Sensing()]
+        if silent:
+            raise InputError(
+                f"arm {self.arm.name!r} does not say how noisy its readings are ({', '.join(silent)}): no "
+                "interval would be true; palpate identify measures it, the parameter assume takes it as in simulation"
+            )
         self._kinds: list[tuple[str, type[Any]]] = []
         self._options: dict[str, Any] = {}
         for what, name, kinds in (

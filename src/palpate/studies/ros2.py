@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..errors import InputError, PalpateError
-from ..ros import Context, Node
+from ..ros import Context, Node, Reliability
 from ..ros.launch import Launch, graph
 from ..ros.messages import Header, InertiaStamped, JointState, JointTrajectory, Time
 from ..ros.tasks import TASKS
@@ -43,6 +43,8 @@ WEIGHING = 10.0
 """of the graph's weighing [s], simulated"""
 WITHIN = 0.01
 """of the mass, relative"""
+_DEEP = Reliability(depth=10_000)
+"""so that a busy machine may stop either side for seconds"""
 _PATIENCE = 60.0
 """for a match, an answer, a mass [s]"""
 _JOINTS = tuple(f"joint_{k}" for k in range(1, 8))
@@ -109,13 +111,13 @@ def build_rust(tree: Path, folder: Path) -> Path:
 
 
 @contextmanager
-def _running(program: Path, *arguments: str) -> Iterator[None]:
+def _running(program: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     peer = subprocess.Popen([str(program), *arguments], stdout=subprocess.PIPE, text=True)
     try:
         assert peer.stdout is not None
         if peer.stdout.readline() != "up\n":
             raise PalpateError(f"{program.name} does not start")
-        yield
+        yield peer
     finally:
         peer.kill()
         peer.wait()
@@ -168,12 +170,12 @@ def stream(program: Path, domain: int, rate: float, seconds: float, *, localhost
 
     values = [0.1 * k for k in range(len(_JOINTS))]
     with (
-        _running(program, "echo", str(domain), topic),
+        _running(program, "echo", str(domain), topic) as peer,
         Context(domain, localhost=localhost) as there,
         Node("palpate_bench", there, quiet=True) as node,
     ):
-        out = node.publish(JointState, topic)
-        node.subscribe(JointState, f"{topic}_echo", take)
+        out = node.publish(JointState, topic, _DEEP)
+        node.subscribe(JointState, f"{topic}_echo", take, _DEEP)
         end = time.monotonic() + _PATIENCE
         while not warm:  # until both ends know both ends
             if time.monotonic() > end:
@@ -194,6 +196,8 @@ def stream(program: Path, domain: int, rate: float, seconds: float, *, localhost
             while (rest := origin + (k + 1) / rate - time.perf_counter()) > 0.0:
                 node.spin_once(rest)
         node.spin_until(lambda: not np.isnan(back).any(), 5.0)
+        if peer.poll() is not None:
+            raise PalpateError(f"{program.name} ended by itself, with code {peer.returncode}")
     trip = 1e3 * (back - begun)[np.isfinite(back)]
     quantiles = np.quantile(trip, [0.5, 0.99]) if len(trip) else np.full(2, np.nan)
     return Stream(
@@ -381,7 +385,7 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     )
     progress(steps, steps, 0.0)
     notes = [
-        "Each JointState goes to the peer and back by reliable topics of depth 1000, so what is not lost there and "
+        "Each JointState goes to the peer and back by reliable topics of depth 10000, so what is not lost there and "
         "back was lost neither way. The sender is Python; times include what else the machine did.",
         "The graph is launched by palpate ros launch mass-estimation in step with its simulated arm. A killed node is "
         "ended by SIGKILL and started anew by the launcher.",

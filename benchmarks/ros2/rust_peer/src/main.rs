@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use futures::StreamExt;
 use mio::{Events, Poll, PollOpt, Ready, Token};
 use ros2_client::parameters::raw;
+use ros2_client::ros2::WriteError;
 use ros2_client::rustdds::no_key::{DataReader, DataWriter};
 use ros2_client::rustdds::{
     policy, DomainParticipant, Duration as DdsDuration, QosPolicies, QosPolicyBuilder, TopicKind,
@@ -67,7 +68,7 @@ fn say(text: &str) {
 
 fn qos() -> QosPolicies {
     QosPolicyBuilder::new()
-        .history(policy::History::KeepLast { depth: 1000 })
+        .history(policy::History::KeepLast { depth: 10_000 })
         .reliability(policy::Reliability::Reliable { max_blocking_time: DdsDuration::from_millis(100) })
         .durability(policy::Durability::Volatile)
         .build()
@@ -94,8 +95,11 @@ fn echo(domain: u16, topic: &str) {
     say("up");
     loop {
         poll.poll(&mut events, Some(Duration::from_millis(500))).unwrap();
-        while let Ok(Some((message, _))) = reader.take() {
-            writer.publish(message).unwrap();
+        while let Ok(Some((mut message, _))) = reader.take() {
+            // a full history is no loss: it empties when the other side has read
+            while let Err(WriteError::WouldBlock { data }) = writer.publish(message) {
+                message = data;
+            }
         }
     }
 }
