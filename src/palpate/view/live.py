@@ -264,7 +264,7 @@ class LiveArm(Source):
         """
         if self._driver.state == "closed":
             self._driver.connect()
-        self._fault, self._last_ns, self._motion = "", None, None
+        self._fault, self._first_ns, self._last_ns, self._motion = "", None, None, None
         self._pipeline.reset()
         self._state.reset()
         self._load, self._touched = Load(), Touched(self._scene.arm)
