@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from palpate import weigh
 from recordings import recording
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("[0-9][0-9]_*.py"))
