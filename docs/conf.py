@@ -15,7 +15,14 @@ author = "The palpate contributors"
 copyright = author
 version = release = installed_version("palpate")
 
-extensions = ["command_help", "mathml", "myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = [
+    "command_help",
+    "result_rows",
+    "mathml",
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+]
 autodoc_typehints = "none"  # the signatures carry them
 autodoc_member_order = "bysource"
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from palpate import weigh
 from recordings import recording
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("[0-9][0-9]_*.py"))
@@ -83,3 +84,19 @@ def test_example(script, tmp_path):
     assert len(lines) == len(expected), run.stdout
     for line, promise in zip(lines, expected, strict=True):
         assert agree(line, promise), f"{line!r} is not as promised: {promise!r}"
+
+
+def test_the_arm_of_the_manual_can_be_read_and_rehearsed_with():
+    """docs/bring-your-own-arm.md walks through this file."""
+    arm = weigh.load_arm(str(Path(__file__).parents[2] / "examples" / "hobby_arm.urdf"))
+    assert arm.n == 4 and arm.has_dynamics and arm.tip == "tool0"
+    scene = weigh.scene(arm, mass=0.2)
+    task = weigh.Task(
+        scene=scene,
+        start=scene.poses[scene.start],
+        poses=(scene.poses[scene.pose],),
+        loads=((0.0, 0.2),),
+        duration=4.0,
+    )
+    found = weigh.weigh_session(weigh.run(task, weigh.make_pipeline(scene.arm)[0]))
+    assert found.status.name == "ok" and abs(found.error_percent) < 2.0

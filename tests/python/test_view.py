@@ -33,6 +33,7 @@ from palpate.view import (
     ShownArm,
     SimulatedArm,
     Tunes,
+    WatchedArm,
     check_address,
 )
 from palpate.view.history import thinned
@@ -387,6 +388,27 @@ def test_a_real_arm_rests_until_its_drives_are_on(scene):
     assert driver.state == "closed"
 
 
+def test_an_arm_that_others_move_is_weighed_and_has_no_buttons(scene):
+    driver = weigh.simulated_driver(task(scene))
+    source = WatchedArm(driver, scene)
+    assert not isinstance(source, Moves) and not isinstance(source, Powers) and isinstance(source, Records)
+    source.connect()
+    reading = source.tick()
+    assert reading.powered and reading.goal is None and mass_badge(reading).text == "warming up"
+    source.stop()
+
+
+def test_drives_are_not_switched_on_outside_the_limits(scene):
+    task_outside = replace(task(scene), start=np.array([3.2, 0, 0, 0, 0, 0, 0.0]))
+    source = RealArm(weigh.simulated_driver(task_outside), scene)
+    source.connect()
+    source.tick()
+    with pytest.raises(InputError, match="outside its limits"):
+        source.power(True)
+    assert not source.powered
+    source.stop()
+
+
 class Broken(Driver):
     """An arm that is lost after some samples, until it is connected again."""
 
@@ -553,6 +575,11 @@ def test_a_taken_port_is_said_with_what_to_do(capsys):
         (["--columns", "c.yaml"], "--columns is for a LOG"),
         (["run.mcap", "--mass", "1"], "--mass is for a simulation"),
         (["--driver", "dynamixel"], "--driver needs --arm"),
+        (["--topic", "/joint_states"], "--topic is for --driver ros"),
+        (
+            ["--driver", "ros", "--host", "robot", "--arm", "justina_left_arm"],
+            "--host is for an arm on a line",
+        ),
         (["--arm", "justina_left_arm", "--driver", "dynamixel"], "--port"),
         (["--pose", "nowhere"], "no pose"),
         (["--mass", "-1"], "mass must be"),

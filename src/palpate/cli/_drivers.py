@@ -74,6 +74,27 @@ def make_driver(
     return FeetechDriver(arm, port, bus=servos, rate=hertz)
 
 
+def make_watcher(
+    arm: Arm, *, topic: str | None, states: str | None, stamp: str | None, rate: float | None
+) -> Driver:
+    """A driver, closed, that watches an arm which others move in a ROS 2 graph.
+
+    Raises:
+        InputError: no such kind of states or stamps.
+        DriverError: the rate is out of range.
+        MissingExtraError: the extra ``ros`` is not installed.
+    """
+    from .. import ros
+    from ..ros.source import KINDS, STAMPS
+
+    kind = next((k for k in KINDS if k == (states or KINDS[0])), None)
+    clock = next((s for s in STAMPS if s == (stamp or STAMPS[0])), None)
+    if kind is None or clock is None:
+        raise InputError(f"--states is {' or '.join(KINDS)}, --stamp is {' or '.join(STAMPS)}")
+    hertz = 250.0 if rate is None else rate
+    return ros.RosDriver(arm, topic or "/joint_states", kind=kind, stamp=clock, rate=hertz, patience=10.0)
+
+
 def _number(port: str) -> int:
     try:
         return int(port)

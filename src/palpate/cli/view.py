@@ -26,9 +26,11 @@ from ._common import (
     open_log,
     say,
 )
-from ._drivers import make_driver
+from ._drivers import make_driver, make_watcher
 
 if TYPE_CHECKING:
+    from ..arm import Arm
+    from ..drivers import Driver
     from ..view import Source
 
 _DEFAULT_ARM = "justina_left_arm"
@@ -48,6 +50,8 @@ def add(app: typer.Typer) -> None:
             "palpate view run.mcap",
             "palpate view log.csv --columns columns.yaml --arm robot.urdf --tip tool0 --effort torque",
             "palpate view --driver dynamixel --port /dev/ttyUSB0 --bus bus.yaml --arm arm.yaml",
+            "palpate view --driver ur --host 192.168.1.10 --arm ur10e.arm.yaml",
+            "palpate view --driver ros --topic /joint_states --arm robot.arm.yaml",
             "palpate view --listen 0.0.0.0:8080",
         ),
     )(run)
@@ -95,13 +99,26 @@ def run(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="A real arm instead of a simulated one: dynamixel or feetech.",
+            help="A real arm instead of a simulated one: dynamixel, feetech, ur, fri; or ros: one that others move and "
+            "that publishes its joints' states.",
             show_default=False,
         ),
     ] = None,
     port: Annotated[
         str | None,
-        typer.Option(metavar="PATH", help="Its serial port, e.g. /dev/ttyUSB0.", show_default=False),
+        typer.Option(
+            metavar="PORT",
+            help="Its serial port, e.g. /dev/ttyUSB0; of fri the UDP port. [default for fri: 30200]",
+            show_default=False,
+        ),
+    ] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Of its controller (ur, fri). [default for fri: whoever sends]",
+            show_default=False,
+        ),
     ] = None,
     bus: Annotated[
         Path | None,
@@ -111,7 +128,36 @@ def run(
             show_default=False,
         ),
     ] = None,
-    rate: Annotated[float, typer.Option(metavar="HZ", help="Rate of a simulated or real arm.")] = 250.0,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            metavar="HZ",
+            help="Rate of a simulated or real arm. [default: 250; 500 for ur and fri]",
+            show_default=False,
+        ),
+    ] = None,
+    topic: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="With --driver ros, where. [default: /joint_states]", show_default=False
+        ),
+    ] = None,
+    states: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND",
+            help="With --driver ros, what: joint_state or lbr_state. [default: joint_state]",
+            show_default=False,
+        ),
+    ] = None,
+    stamp: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CLOCK",
+            help="With --driver ros, whose time counts: header or arrival. [default: header]",
+            show_default=False,
+        ),
+    ] = None,
     columns: Columns = None,
     effort: Effort = None,
     base: Base = None,
@@ -135,26 +181,43 @@ def run(
     quiet: Quiet = False,
 ) -> int:
     """View."""
-    from ..view import Page
+    from .. import weigh as weighing
+    from ..view import Page, WatchedArm
     from ._live import interruptible
 
     if log is not None:
         only("a simulation", "LOG is a recording", {"--mass": mass, "--pose": pose})
-        only("a real arm", "LOG is a recording", {"--driver": driver})
+        only("a live arm", "LOG is a recording", {"--driver": driver, "--rate": rate})
     else:
-        only("a LOG", "nothing is recorded yet", {"--columns": columns, "--effort": effort})
+        only("a LOG", "nothing is recorded yet", {"--columns": columns})
+        if driver != "ros":
+            only("a LOG or --driver ros", "it is neither", {"--effort": effort})
+    if driver != "ros":
+        only("--driver ros", "it is not given", {"--topic": topic, "--states": states, "--stamp": stamp})
+    on_line = {"--port": port, "--bus": bus, "--host": host}
     if driver is None:
-        only("a real arm", "there is no --driver", {"--port": port, "--bus": bus})
-    else:
+        only("a real arm", "there is no --driver", on_line)
+    elif driver == "ros":
+        only("an arm on a line of its own", "a ROS 2 graph has topics", on_line)
+    if driver is not None:
         only("a simulation", "the arm is real", {"--mass": mass, "--pose": pose})
     host, number = address(listen)
     source: Source
     if log is not None:
         source = _recording(log, arm, columns, base=base, tip=tip, repair=repair, effort=effort)
     elif driver is not None:
-        source = _real(driver, arm, port, bus, rate, out, base=base, tip=tip, repair=repair)
+        if arm is None:
+            raise InputError("--driver needs --arm: which arm is it?")
+        model = open_arm(arm, base=base, tip=tip, repair=repair, effort=effort)
+        if driver == "ros":
+            watcher = make_watcher(model, topic=topic, states=states, stamp=stamp, rate=rate)
+            source = WatchedArm(watcher, weighing.scene(model), out=make_folder(out))
+        else:
+            hardware = make_driver(driver, model, port=port, bus=bus, host=host, rate=rate)
+            source = _real(model, hardware, out)
     else:
-        source = _simulated(arm, mass, pose, rate, noise, seed, out, base=base, tip=tip, repair=repair)
+        model = open_arm(arm or _DEFAULT_ARM, base=base, tip=tip, repair=repair)
+        source = _simulated(model, mass, pose, 250.0 if rate is None else rate, noise, seed, out)
     page = Page(source, host=host, port=number, title=source.arms[0].name, meshes=meshes)
     try:
         source.start()
@@ -210,26 +273,11 @@ def _recording(
     return Recording(open_log(log, columns), model)
 
 
-def _real(
-    driver: str,
-    arm: str | None,
-    port: str | None,
-    bus: Path | None,
-    rate: float,
-    out: Path,
-    *,
-    base: str | None,
-    tip: str | None,
-    repair: bool,
-) -> Source:
+def _real(model: Arm, hardware: Driver, out: Path) -> Source:
     from .. import weigh as weighing
     from ..view import RealArm
 
-    if arm is None:
-        raise InputError("--driver needs --arm: which arm hangs on the port?")
-    model = open_arm(arm, base=base, tip=tip, repair=repair)
-    hardware = make_driver(driver, model, port, bus, rate)
-    hardware.connect()
+    hardware.connect()  # only then it says what its effort is
     try:
         return RealArm(hardware, weighing.scene(weighing.driven_arm(model, hardware)), out=make_folder(out))
     except BaseException:
@@ -238,33 +286,18 @@ def _real(
 
 
 def _simulated(
-    arm: str | None,
-    mass: float | None,
-    pose: str | None,
-    rate: float,
-    noise: bool,
-    seed: int,
-    out: Path,
-    *,
-    base: str | None,
-    tip: str | None,
-    repair: bool,
+    model: Arm, mass: float | None, pose: str | None, rate: float, noise: bool, seed: int, out: Path
 ) -> Source:
     from .. import weigh as weighing
     from ..view import SimulatedArm
 
     if mass is not None:
         weighing.check_mass(mass)
-    scene = weighing.scene(open_arm(arm or _DEFAULT_ARM, base=base, tip=tip, repair=repair), mass=mass)
+    scene = weighing.scene(model, mass=mass)
     name, goal = weighing.find_pose(scene, pose or scene.pose)
-    task = weighing.Task(
-        scene=scene, start=scene.poses[scene.start], poses=(goal,), rate=rate, noise=noise, seed=seed
-    )
-    source = SimulatedArm(
-        weighing.simulated_driver(task),
-        scene,
-        out=make_folder(out),
-        mass=scene.mass if mass is None else mass,
-    )
+    start = scene.poses[scene.start]
+    task = weighing.Task(scene=scene, start=start, poses=(goal,), rate=rate, noise=noise, seed=seed)
+    held = scene.mass if mass is None else mass
+    source = SimulatedArm(weighing.simulated_driver(task), scene, out=make_folder(out), mass=held)
     source.send(name)
     return source

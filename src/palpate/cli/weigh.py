@@ -35,7 +35,7 @@ from ._common import (
     say,
     status_words,
 )
-from ._drivers import line_summary, line_words, make_driver
+from ._drivers import line_summary, line_words, make_driver, make_watcher
 
 if TYPE_CHECKING:
     from ..arm import Arm
@@ -269,7 +269,8 @@ def run(
         if arm is None:
             raise InputError("--driver ros needs --arm: which arm is published?")
         model = open_arm(arm, base=base, tip=tip, repair=repair, effort=effort)
-        watched = _watch(model, topic or "/joint_states", states, stamp, rate, duration)
+        watcher = make_watcher(model, topic=topic, states=states, stamp=stamp, rate=rate)
+        watched = _watch(model, watcher, duration)
         if record:
             files["log"] = str(_recording(out))
             watched.save(files["log"], overwrite=True)
@@ -354,21 +355,11 @@ def _real_arm(arm: str | None, pose: str | None, *, base: str | None, tip: str |
     return open_arm(arm, base=base, tip=tip, repair=repair)
 
 
-def _watch(
-    model: Arm, topic: str, states: str | None, stamp: str | None, rate: float | None, seconds: float
-) -> Log:
+def _watch(model: Arm, driver: Driver, seconds: float) -> Log:
     """What is published of an arm that others move."""
     from .. import ros
-    from ..ros.source import KINDS, STAMPS
     from ._live import interruptible
 
-    kind = next((k for k in KINDS if k == (states or KINDS[0])), None)
-    clock = next((s for s in STAMPS if s == (stamp or STAMPS[0])), None)
-    if kind is None or clock is None:
-        raise InputError(f"--states is {' or '.join(KINDS)}, --stamp is {' or '.join(STAMPS)}")
-    driver = ros.RosDriver(
-        model, topic, kind=kind, stamp=clock, rate=250.0 if rate is None else rate, patience=10.0
-    )
     with interruptible() as stopped, driver:
         return ros.collect(model, driver, seconds, stop=stopped)
 

@@ -27,14 +27,14 @@ A page of two arms and a camera is a source whose ``arms`` has two entries, plac
     source.start()
     page.run(stop=lambda: done)
 
-:class:`SimulatedArm` and :class:`RealArm` are sources with a loop of their own at the driver's rate;
-:class:`Recording` is a log. Needs the extra ``view``.
+:class:`SimulatedArm`, :class:`RealArm` and :class:`WatchedArm` are sources with a loop of their own at the driver's
+rate; :class:`Recording` is a log. Needs the extra ``view``.
 """
 
 from __future__ import annotations
 
 from .history import History
-from .live import LiveArm, Motion, RealArm, SimulatedArm, view_pipeline
+from .live import LiveArm, Motion, MovedArm, RealArm, SimulatedArm, WatchedArm, view_pipeline
 from .page import FPS, Page, check_address
 from .playback import Recording
 from .scene import Badge, Channels, Force, ForceView, Reading, Scale, ShownArm, Weight
@@ -51,6 +51,7 @@ __all__ = [
     "Image",
     "LiveArm",
     "Motion",
+    "MovedArm",
     "Moves",
     "Page",
     "Plays",
@@ -65,6 +66,7 @@ __all__ = [
     "SimulatedArm",
     "Source",
     "Tunes",
+    "WatchedArm",
     "Weight",
     "check_address",
     "view_pipeline",

@@ -264,7 +264,7 @@ class LiveArm(Source):
         """
         if self._driver.state == "closed":
             self._driver.connect()
-        self._fault, self._last_ns, self._motion = "", None, None
+        self._fault, self._first_ns, self._last_ns, self._motion = "", None, None, None
         self._pipeline.reset()
         self._state.reset()
         self._load, self._touched = Load(), Touched(self._scene.arm)
@@ -337,7 +337,7 @@ class LiveArm(Source):
             torque=np.asarray(sample.effort) * self._gain,
             goal=None if goal is None else goal.q,
             held_back=held_back,
-            powered=goal is not None,
+            powered=self._powered(goal),
             true_mass=math.nan if truth is None else truth[2],
         )
         if self._recorder is not None:
@@ -368,6 +368,10 @@ class LiveArm(Source):
 
     def _truth(self) -> tuple[Array, Array, float] | None:
         return None
+
+    def _powered(self, goal: Setpoint | None) -> bool:
+        """Whether drives hold the arm, so that their torque tells what it holds."""
+        return goal is not None
 
     def _do(self, wish: Callable[[], T]) -> T:
         """Let the loop do it between two periods, and wait; without a loop, at once."""
@@ -426,32 +430,6 @@ class LiveArm(Source):
         return found
 
     # --- what a person wants -------------------------------------------------------------------------------------
-
-    def go(self, arm: int, pose: str) -> None:
-        """See :class:`Moves`.
-
-        Raises:
-            InputError: no such pose.
-            DriverError: the drives are off.
-        """
-        _, goal = find_pose(self._scene, pose)
-
-        def wish() -> None:
-            if self._driver.state != "enabled":
-                raise DriverError("the drives are off: switch them on first")
-            self._goal = goal
-
-        self._do(wish)
-
-    def halt(self, arm: int) -> None:
-        """See :class:`Moves`."""
-
-        def wish() -> None:
-            self._goal = None
-            if self._motion is not None:
-                self._motion.halt()
-
-        self._do(wish)
 
     @property
     def recording(self) -> Path | None:
@@ -526,7 +504,44 @@ class LiveArm(Source):
         self._do(swap)
 
 
-class SimulatedArm(LiveArm):
+class WatchedArm(LiveArm):
+    """An arm that others move, such as one that publishes its joints' states in a ROS 2 graph: it is only read."""
+
+    def _powered(self, goal: Setpoint | None) -> bool:
+        return True
+
+
+class MovedArm(LiveArm):
+    """A live arm that goes where it is told."""
+
+    def go(self, arm: int, pose: str) -> None:
+        """See :class:`Moves`.
+
+        Raises:
+            InputError: no such pose.
+            DriverError: the drives are off.
+        """
+        _, goal = find_pose(self._scene, pose)
+
+        def wish() -> None:
+            if self._driver.state != "enabled":
+                raise DriverError("the drives are off: switch them on first")
+            self._goal = goal
+
+        self._do(wish)
+
+    def halt(self, arm: int) -> None:
+        """See :class:`Moves`."""
+
+        def wish() -> None:
+            self._goal = None
+            if self._motion is not None:
+                self._motion.halt()
+
+        self._do(wish)
+
+
+class SimulatedArm(MovedArm):
     """A simulated arm in real time, with a hand to put things into and links to push.
 
     Args:
@@ -628,7 +643,7 @@ class SimulatedArm(LiveArm):
         self._do(change)
 
 
-class RealArm(LiveArm):
+class RealArm(MovedArm):
     """A real arm; its drives are off until somebody switches them on."""
 
     @property
@@ -650,11 +665,27 @@ class RealArm(LiveArm):
             if not on:
                 self._driver.disable()
             elif self._driver.state != "enabled":
+                self._check_pose()
                 self._driver.enable()
                 self._pipeline.reset()
                 self._touched = Touched(self._scene.arm)
 
         self._do(switch)
+
+    def _check_pose(self) -> None:
+        """Refuse to hold an arm that is outside its limits.
+
+        Raises:
+            InputError: it is; most likely a zero or a direction is wrong.
+        """
+        if self._newest is None:
+            return
+        for joint, angle in zip(self._scene.arm.joints, self._newest.sample.position, strict=True):
+            if not joint.limits.lower <= angle <= joint.limits.upper:
+                raise InputError(
+                    f"{joint.name} reads {angle:.4g} rad, outside its limits {joint.limits.lower:.4g} to "
+                    f"{joint.limits.upper:.4g} rad: move the arm inside, or correct its zero or direction"
+                )
 
     def _driver_words(self) -> str:
         return "drives on" if self.powered else "drives off: hold the arm before you switch them on"
