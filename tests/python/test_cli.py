@@ -34,6 +34,7 @@ VERBS = (
     "arm",
     "data",
     "see",
+    "teleop",
 )
 
 
