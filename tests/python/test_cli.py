@@ -36,6 +36,7 @@ VERBS = (
     "see",
     "ros",
     "wipe",
+    "teleop",
 )
 
 

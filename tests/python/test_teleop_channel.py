@@ -280,3 +280,43 @@ def test_the_packet_says_what_the_module_says() -> None:
     packet = Sealer(KEY, "slave", 1, 3).seal(message(1), 0)
     assert packet[:4] == b"PT\x01\x02" and len(packet) == 28 + 50 + 72 + 16
     assert module.LONGEST >= len(Sealer(KEY, "slave", 1, 16).seal(message(1, n=16), 0))
+
+
+UNDER_NETEM = """
+import time
+import numpy as np
+from palpate.teleop import Message, UdpChannel
+key = bytes(range(32))
+with UdpChannel(key, "slave", 3) as slave, UdpChannel(key, "master", 3, peer=slave.address) as master:
+    end, count, heard = time.monotonic() + 60.0, 0, 0
+    while heard < 100 and time.monotonic() < end:
+        count += 1
+        for side in (master, slave):
+            side.send(Message(side.session, count, 0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0.0, True))
+        heard += len(slave.receive())
+        master.receive()
+        time.sleep(0.001)
+    print(heard, master.sealer.clock.round_trip)
+"""
+
+
+def test_the_kernels_bad_network() -> None:
+    """``tc netem`` in a network namespace of its own, where the kernel has it and lets us."""
+    setup = "ip link set lo up && tc qdisc add dev lo root netem delay 10ms 3ms loss 10% duplicate 5%"
+    try:
+        tried = subprocess.run(
+            ["unshare", "-rn", "sh", "-c", setup], capture_output=True, text=True, check=False
+        )
+    except FileNotFoundError:
+        pytest.skip("unshare is not installed: no network namespace to be had")
+    if tried.returncode != 0:
+        reason = (tried.stderr.strip().splitlines() or ["no reason given"])[-1]
+        pytest.skip(f"no netem here ({reason}): the fault layer of the process is tested instead")
+    run = subprocess.run(
+        ["unshare", "-rn", "sh", "-c", f'{setup} && exec "$0" -c "$1"', sys.executable, UNDER_NETEM],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    heard, trip = run.stdout.split()
+    assert int(heard) >= 100 and float(trip) >= 0.01

@@ -158,7 +158,7 @@ def run(
     setup = build(
         None if scene == "free" else scene,
         arm=arm,
-        coupling=coupling,  # type: ignore[arg-type]
+        coupling=coupling,
         stiffness=stiffness,
         press=press,
         masses=tuple(mass or (0.5, 1.2)),

@@ -17,7 +17,7 @@ from ._rows import at_most, told
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-EPISODES, QUICK = 10_000, 60
+EPISODES, QUICK = 10_000, 15
 COMPARED = 1_000
 """of them are run without the layer and with waves too"""
 SHAKING = 0.25

@@ -233,57 +233,57 @@ class Sealer:
     def open(self, packet: bytes, now_ns: int) -> Message | None:
         """The message of a packet that came; None if it is refused (see :attr:`refused`) or a greeting."""
         if len(packet) < _HEADER.size + _TAG or packet[:2] != b"PT" or len(packet) > LONGEST:
-            return self._refuse("not ours", f"{len(packet)} bytes that are no packet of palpate")
+            return self._refused("not ours", f"{len(packet)} bytes that are no packet of palpate")
         header = packet[: _HEADER.size]
         _, version, role, salt, session, sequence = _HEADER.unpack(header)
         if version != VERSION:
-            return self._refuse(
+            return self._refused(
                 "version",
                 f"the other side speaks protocol version {version}, this one {VERSION}: install the same palpate on "
                 "both",
             )
         if role == _number(self.role):
-            return self._refuse("role", f"both sides say they are the {self.role}")
+            return self._refused("role", f"both sides say they are the {self.role}")
         if session < self._peer_session:
-            return self._refuse("replayed", "of an earlier run: replayed, or very late")
+            return self._refused("replayed", "of an earlier run: replayed, or very late")
         cipher = self._cipher(salt)
         try:
             body = cipher.decrypt(_nonce(sequence), packet[_HEADER.size :], header)
         except _invalid_tag():
-            return self._refuse(
+            return self._refused(
                 "forged", "another key, or changed on the way: the two sides need the same key file"
             )
         if len(body) < _BODY.size:
-            return self._refuse("length", f"a body of {len(body)} bytes")
+            return self._refused("length", f"a body of {len(body)} bytes")
         echo, sent_ns, echo_time, echo_age, n, flags, energy, level = _BODY.unpack(body[: _BODY.size])
         if n != self.n or len(body) != _BODY.size + 24 * n:
-            return self._refuse("axes", f"the other side has {n} axes, this one {self.n}")
+            return self._refused("axes", f"the other side has {n} axes, this one {self.n}")
         if echo != self.salt:
             # Whoever is there now will hear our salt and echo it; what was recorded never will. A live side is not
             # left for it.
             if self._heard is None or now_ns - self._heard[1] > _SILENCE_NS:
                 self._echo = salt
-            return self._refuse("greeting", "a greeting, or of an earlier run: it does not know this one")
+            return self._refused("greeting", "a greeting, or of an earlier run: it does not know this one")
         if salt != self._peer_salt:
             self._peer_salt, self._peer_session, self._echo = salt, session, salt
             self._newest, self._seen, self._heard = 0, 0, None
             self.clock = Clock()
         if not self._fresh(sequence):
-            return self._refuse(
+            return self._refused(
                 "replayed", f"number {sequence} has come before, or is far behind: replayed or repeated"
             )
         if echo_age >= 0:
             self.clock.take(echo_time, sent_ns - echo_age, sent_ns, now_ns)
         self._heard = (sent_ns, now_ns)
         if not abs(self.clock.offset) <= MAX_CLOCK_OFFSET and not math.isnan(self.clock.offset):
-            return self._refuse(
+            return self._refused(
                 "clocks",
                 f"the clocks differ by {self.clock.offset:+.0f} s: set them (chrony, NTP); at most "
                 f"{MAX_CLOCK_OFFSET:g} s are allowed",
             )
         values = np.frombuffer(body, dtype=">f8", offset=_BODY.size).astype(np.float64)
         if not (np.isfinite(values).all() and math.isfinite(energy) and math.isfinite(level)):
-            return self._refuse("not finite", "a number is not finite")
+            return self._refused("not finite", "a number is not finite")
         return Message(
             session,
             sequence,
@@ -317,9 +317,11 @@ class Sealer:
         self._seen |= 1 << behind
         return True
 
-    def _refuse(self, kind: str, reason: str) -> None:
+    def _refused(self, kind: str, reason: str) -> Message | None:
+        """No message, and why."""
         self.refused[kind] += 1
         self.reason = reason
+        return None
 
     def refusals(self) -> dict[str, int]:
         """Packets that were refused, by reason; greetings are none."""
@@ -527,7 +529,7 @@ class UdpChannel:
 
     def receive(self) -> list[Message]:
         """All messages that have come since the last call, in order of arrival."""
-        found = []
+        found: list[Message] = []
         self.flush()
         while True:
             try:

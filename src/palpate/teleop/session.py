@@ -89,20 +89,28 @@ class Run:
     @classmethod
     def empty(cls, count: int, n: int) -> Run:
         """Room for `count` periods of a slave with `n` joints."""
-        three = {
-            name: np.zeros((count, 3))
-            for name in (
-                "device device_velocity wanted tip tip_velocity reference force felt estimated std true".split()
-            )
-        }
+
+        def three() -> Array:
+            return np.zeros((count, 3))
+
         return cls(
-            time=np.arange(count) * PERIOD,
+            time=np.arange(count, dtype=np.float64) * PERIOD,
+            device=three(),
+            device_velocity=three(),
+            wanted=three(),
+            tip=three(),
+            tip_velocity=three(),
+            reference=three(),
+            force=three(),
+            felt=three(),
+            estimated=three(),
+            std=three(),
+            true=three(),
             master_events=np.zeros(count, dtype=np.int64),
             slave_events=np.zeros(count, dtype=np.int64),
             levels=np.zeros((count, 2)),
             q=np.zeros((count, n)),
             effort=np.zeros((count, n)),
-            **three,
         )
 
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._core import MomentumObserver, Status, WrenchEstimator
+from .._core import HeldLoad, MomentumObserver, Status, WrenchEstimator
 from ..arm import Arm, Array
 from ..drivers.mujoco import MujocoDriver
 from ..errors import DriverError, InputError
-from ..pipeline import HeldLoad, Pipeline, Touch
+from ..pipeline import Pipeline, Touch
 from ..simulate import Load, Plant, SensorModel
 
 if TYPE_CHECKING:
