@@ -48,7 +48,9 @@ def scene():
 
 
 def task(scene, rate=RATE, **options):
-    return weigh.Task(scene=scene, start=scene.poses["Zero"], poses=(scene.poses["Take3"],), rate=rate, **options)
+    return weigh.Task(
+        scene=scene, start=scene.poses["Zero"], poses=(scene.poses["Take3"],), rate=rate, **options
+    )
 
 
 @pytest.fixture
@@ -106,7 +108,9 @@ def test_a_history_keeps_every_spike_however_it_is_fed(chunk):
 
 def test_a_history_does_not_grow():
     history = History(4)
-    rings = [a.nbytes for level in history._levels.values() for a in vars(level).values() if hasattr(a, "nbytes")]
+    rings = [
+        a.nbytes for level in history._levels.values() for a in vars(level).values() if hasattr(a, "nbytes")
+    ]
     for hour in range(3):
         t = hour * 3600.0 + np.arange(0.0, 3600.0, 0.1)
         history.add(t, np.random.default_rng(hour).normal(size=(len(t), 4)))
@@ -314,7 +318,9 @@ def test_a_push_is_told_from_the_load(arm):
 
 def test_a_grasped_object_becomes_a_load_and_is_no_contact_for_ever():
     scene = weigh.scene(weigh.load_arm("kuka_lbr_iiwa7"))
-    plan = weigh.Task(scene=scene, start=scene.poses[scene.start], poses=(scene.poses[scene.pose],), rate=RATE)
+    plan = weigh.Task(
+        scene=scene, start=scene.poses[scene.start], poses=(scene.poses[scene.pose],), rate=RATE
+    )
     source = SimulatedArm(weigh.simulated_driver(plan), scene, mass=2.0)
     source.send(scene.pose)
     source.connect()
@@ -439,7 +445,9 @@ def test_the_loop_runs_by_itself_and_does_what_is_wished(scene, tmp_path):
     source.start()
     source.start()
     source.hold(0, 0.1)
-    wait_for(lambda: source.reading(0) is not None and source.reading(0).true_mass == 0.1, "the object is held")
+    wait_for(
+        lambda: source.reading(0) is not None and source.reading(0).true_mass == 0.1, "the object is held"
+    )
     source.record()
     wait_for(lambda: source.reading(0).time > 1.0, "time goes on")
     path = source.recording
@@ -502,7 +510,9 @@ def test_a_recording_shows_what_the_pipeline_says(log):
     assert source.spans == (math.inf,)
     time_s, rows = source.curves(0, math.inf)
     assert len(time_s) <= 482 and rows.shape[1] == Channels(7).count
-    assert not any(lit_links(r)[0] >= 0 for r in map(lambda p: (source.seek(p), source.reading(0))[1], range(6)))
+    assert not any(
+        lit_links(r)[0] >= 0 for r in map(lambda p: (source.seek(p), source.reading(0))[1], range(6))
+    )
     options = source.options(0)
     options["observer"] = {"name": "momentum", "bandwidth": 12.0}
     source.tune(0, options)

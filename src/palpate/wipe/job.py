@@ -68,7 +68,7 @@ class WipeJob:
     # -- from any thread -------------------------------------------------------
 
     def pause(self) -> None:
-        """Both arms come to rest, the eraser's stays compliant; from any thread."""
+        """Both hands come to rest; the eraser's stays compliant, and its elbow may still settle; from any thread."""
         self._wish.put("pause")
 
     def resume(self) -> None:
