@@ -145,7 +145,7 @@ def test_run_is_step(arm):
 def test_moving_in_the_plane_neither_lifts_nor_tips_the_tool(arm):
     """The tool's acceleration under the command and the surface's force, with and without the decoupling."""
     x, R = pose(arm, BENT)
-    target = pp.CartesianTarget(x + [0.2, -0.1, 0.0], R, speed=0.3, normal_force=2.5)
+    target = pp.CartesianTarget(x + np.array([0.2, -0.1, 0.0]), R, speed=0.3, normal_force=2.5)
     felt = np.array([0.7, 0.4, 2.5])  # friction, and just the force that is wanted
     M, g = arm.mass_matrix(BENT), arm.gravity_torque(BENT)
     J = arm.jacobian(BENT, arm.grasp)

@@ -1,8 +1,14 @@
-"""Wiping a whiteboard: where to go with the eraser, and what that does to the ink. Needs ``palpate[wipe]``.
+"""Wiping a whiteboard: see it, hold it, erase it with bounded force, and check. Needs ``palpate[wipe]``.
 
 >>> from palpate import vision, wipe
 >>> sight = vision.see(vision.load("photo.jpg"), size=(0.90, 0.60))  # doctest: +SKIP
 >>> wipe.plan(sight.ink_polygons, (0.90, 0.60), keep=sight.object_polygons).legs  # doctest: +SKIP
+
+The whole job in simulation:
+
+>>> layer, setting = wipe.random_board(1)
+>>> wipe.WipeJob(wipe.BoardScene(layer, setting)).run().verdict  # doctest: +SKIP
+'clean'
 """
 
 from __future__ import annotations
@@ -11,11 +17,13 @@ try:
     import cv2 as _cv2  # noqa: F401  the rest of the package needs these
     import scipy as _scipy  # noqa: F401
     import shapely as _shapely  # noqa: F401
+    import statemachine as _statemachine  # noqa: F401
 except ImportError:
     from ..errors import MissingExtraError
 
     raise MissingExtraError("wipe", "wiping a board") from None
 
+from .boards import random_board
 from .choice import COLOURS, Choice, choose, ink_colours
 from .ink import InkLayer, handwriting
 from .job import WipeJob
@@ -52,6 +60,7 @@ __all__ = [
     "ink_colours",
     "inverse_kinematics",
     "plan",
+    "random_board",
     "reachable",
     "swept",
     "tool_poses",
