@@ -142,6 +142,25 @@ def test_run_is_step(arm):
         np.testing.assert_array_equal(np.concatenate((command.force, command.moment)), wrench[i])
 
 
+def test_moving_in_the_plane_neither_lifts_nor_tips_the_tool(arm):
+    """The tool's acceleration under the command and the surface's force, with and without the decoupling."""
+    x, R = pose(arm, BENT)
+    target = pp.CartesianTarget(x + np.array([0.2, -0.1, 0.0]), R, speed=0.3, normal_force=2.5)
+    felt = np.array([0.7, 0.4, 2.5])  # friction, and just the force that is wanted
+    M, g = arm.mass_matrix(BENT), arm.gravity_torque(BENT)
+    J = arm.jacobian(BENT, arm.grasp)
+    lifted = {}
+    for decoupled in (True, False):
+        command = pp.CartesianVelocity(arm, 0.004, decoupled=decoupled).step(
+            target, BENT, np.zeros(7), force=felt
+        )
+        assert np.linalg.norm(command.force) <= 5.0 and np.linalg.norm(command.moment) <= 2.0
+        acceleration = J @ np.linalg.solve(M, command.torque - g + J[:3].T @ felt)
+        assert np.linalg.norm(acceleration[:2]) > 0.1
+        lifted[decoupled] = np.abs(acceleration[2:])
+    assert lifted[True].max() < 1e-9 and lifted[False].max() > 0.1
+
+
 def test_without_the_force_nothing_is_pressed(arm):
     x, R = pose(arm, BENT)
     controller = pp.CartesianVelocity(arm, 0.004)

@@ -31,7 +31,7 @@ _EXTRAS = {
     "xacro": (("xacro",), "arms from .xacro files"),
     "data": (("pooch",), "palpate data get"),
     "vision": (("cv2",), "whiteboards in pictures"),
-    "wipe": (("shapely", "scipy", "cv2"), "an eraser's strokes, ink, the board's scene"),
+    "wipe": (("shapely", "scipy", "cv2", "statemachine"), "wiping a board: strokes, ink, scene, the job"),
 }
 _DRAW = (
     "from palpate.simulate import Plant; from palpate import robots; "

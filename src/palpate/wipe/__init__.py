@@ -1,8 +1,14 @@
-"""Wiping a whiteboard: seeing, holding, wiping, checking, and a world to try it in. Needs ``palpate[wipe]``.
+"""Wiping a whiteboard: see it, hold it, erase it with bounded force, and check. Needs ``palpate[wipe]``.
 
 >>> from palpate import vision, wipe
 >>> sight = vision.see(vision.load("photo.jpg"), size=(0.90, 0.60))  # doctest: +SKIP
 >>> wipe.plan(sight.ink_polygons, (0.90, 0.60), keep=sight.object_polygons).legs  # doctest: +SKIP
+
+The whole job in simulation:
+
+>>> layer, setting = wipe.random_board(1)
+>>> wipe.WipeJob(wipe.BoardScene(layer, setting)).run().verdict  # doctest: +SKIP
+'clean'
 """
 
 from __future__ import annotations
@@ -17,6 +23,7 @@ except ImportError:
 
     raise MissingExtraError("wipe", "wiping a board") from None
 
+from .boards import random_board
 from .choice import COLOURS, Choice, choose, ink_colours
 from .film import Film, Video
 from .ink import InkLayer, handwriting
@@ -59,6 +66,7 @@ __all__ = [
     "ink_colours",
     "inverse_kinematics",
     "plan",
+    "random_board",
     "reachable",
     "report",
     "summary",

@@ -10,10 +10,11 @@ from typing import Protocol
 
 import numpy as np
 
+from .._core import MomentumObserver, Status, WrenchEstimator
 from ..arm import Arm, Array, Effort, Sensing
 from ..control import CartesianTarget, CartesianVelocity, SafetyLimiter, Setpoint
 from ..logs import Sample
-from ..pipeline import MomentumObserver, Pipeline, Status, WrenchEstimator
+from ..pipeline import Pipeline
 from ..velocity import JointVelocity
 from .activity import Activity, Slot
 from .motion import BRAKING, Path, joint_torque

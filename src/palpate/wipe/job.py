@@ -68,7 +68,7 @@ class WipeJob:
     # -- from any thread -------------------------------------------------------
 
     def pause(self) -> None:
-        """Both arms come to rest, the eraser's stays compliant; from any thread."""
+        """Both hands come to rest; the eraser's stays compliant, and its elbow may still settle; from any thread."""
         self._wish.put("pause")
 
     def resume(self) -> None:
@@ -303,7 +303,20 @@ class WipeJob:
     def _result(self, mediator: Mediator, wall: float, activities: tuple[Activity, ...]) -> JobResult:
         rows = np.array(self._rows).reshape(-1, 13)
         c = rows.T
-        track = Track(c[0], np.array(self._phases), *c[1:7], rows[:, 7:10], c[10], c[11] > 0.5, c[12] > 0.5)
+        track = Track(
+            time=c[0],
+            phase=np.array(self._phases, dtype=np.str_),
+            wanted=c[1],
+            estimated=c[2],
+            normal=c[3],
+            contact=c[4],
+            force=c[5],
+            moment=c[6],
+            tool=rows[:, 7:10],
+            moved=c[10],
+            yielding=c[11] > 0.5,
+            held=c[12] > 0.5,
+        )
         times: dict[str, Timing] = {
             a.name: timing(a.period_ns * 1e-9, self._cycles[a.name]) for a in activities
         }

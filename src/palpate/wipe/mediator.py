@@ -167,7 +167,7 @@ def displacement(reference: Look, now: Look) -> float | None:
         found = cv2.matchTemplate(second[top : v + b + 1, left : u + b + 1], patch, cv2.TM_CCOEFF_NORMED)
         _, best, _, at = cv2.minMaxLoc(found)
         if best > LIKE:
-            shift = np.array(at, dtype=np.float64) + [left - u + a, top - v + a]
+            shift = np.array([at[0] + left - u + a, at[1] + top - v + a])
             ways.append(plane.to_board(corner + shift) - plane.to_board(corner))
     for p, q in itertools.combinations(ways, 2):
         if float(np.linalg.norm(p - q)) < SAME:

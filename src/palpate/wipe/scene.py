@@ -243,7 +243,8 @@ class BoardScene:
     @property
     def T_holder_base(self) -> Array:
         """(4, 4) from the base of the eraser's arm to that of the holder's."""
-        return np.linalg.inv(_holder_base())
+        T: Array = np.linalg.inv(_holder_base())
+        return T
 
     @property
     def pad_forces(self) -> Array:

@@ -34,6 +34,8 @@ BACK = 0.08
 """way of the gripper's fingers towards the rim [m]"""
 
 
+FREE = 0.003
+"""a hand about to take the board keeps so far from everything [m]"""
 TURN = 0.6
 """no joint turns further on such a short way, or the hand would leave it [rad]"""
 
@@ -219,10 +221,10 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
         """By a rim that is not the eraser's side, fingers a little inclined so that the hand stays off the table."""
         arm, (W, H) = self._scene.arms[1], self._scene.ink.size
         T = self._scene.T_holder_base @ now.T_base_board
-        out = np.array([0.0, 0.0, 1.0])
+        out, clearance = np.array([0.0, 0.0, 1.0]), self._clearance(1, now)
         rims = [((a * W, -FRAME), (0.0, 1.0)) for a in (0.5, 0.3, 0.7)]
         rims += [((W + FRAME, 0.3 * H), (-1.0, 0.0)), ((-FRAME, 0.3 * H), (1.0, 0.0))]
-        for (at, inward), incline, side in itertools.product(rims, (0.15, 0.0), (1.0, -1.0)):
+        for (at, inward), incline, side in itertools.product(rims, (0.15, 0.3, 0.0), (1.0, -1.0)):
             c, s = math.cos(incline), math.sin(incline)
             d = np.array([*inward, 0.0])
             z, y = c * d + s * out, side * (c * out - s * d)
@@ -235,6 +237,8 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
             goal = None if q is None else inverse_kinematics(arm, T @ grasp, q=q)
             if q is None or goal is None or float(np.abs(goal - q).max()) > TURN:
                 continue
+            if clearance(q) < FREE or clearance(goal) < -FREE:
+                continue  # the hand would be in the table; its fingers are about the rim
             path = self._way(1, now, q)
             if path is not None:
                 return Route((path, Path((q, goal), 0.2)))
