@@ -112,6 +112,7 @@ def report(result: JobResult, options: JobOptions, scene: BoardScene, title: str
             }
             for name, t in result.timing.items()
         ],
+        limited=options.limited,
         settings={
             "speed": f"{options.speed:g} m/s",
             "normal force": f"{options.normal_force:g} N",
