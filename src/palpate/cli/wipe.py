@@ -453,7 +453,13 @@ def _tell(result: JobResult, options: JobOptions, files: dict[str, str], remarks
         verdict.append(f": {result.reason}", style="")
     rows: list[tuple[str, Text | str]] = [("board", verdict)]
     if result.ink_left == result.ink_left:
-        rows.append(("ink left", f"{100.0 * result.ink_left:.2g} % of {1e4 * result.ink_before:.1f} cm²"))
+        rows.append(
+            (
+                "ink left",
+                f"{100.0 * result.ink_left:.2g} % of {1e4 * result.ink_before:.1f} cm²"
+                + (", some of which was to stay" if options.limited else ""),
+            )
+        )
     rows.append(("passes", str(len(result.passes))))
     if told["within_band"] is not None:
         rows.append(

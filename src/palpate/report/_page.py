@@ -40,7 +40,7 @@ border:1.5px solid var(--tone);background:color-mix(in srgb,var(--tone) 22%,tran
 .facts dd small{{display:block;font-size:.83rem;font-weight:400;color:var(--muted)}}
 figure{{margin:.6rem 0 0;break-inside:avoid}}
 .panels{{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(300px,100%),1fr));gap:8px 14px}}
-.pair{{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(420px,100%),1fr));gap:8px 18px}}
+.pair{{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(420px,100%),1fr));gap:8px 18px}}
 .panels figure,.pair figure{{margin:0}}
 .pair img{{display:block;width:100%;height:auto;border-radius:8px}}
 svg.fig{{display:block;width:100%;height:auto;fill:var(--ink);stroke-linejoin:round;stroke-linecap:butt}}

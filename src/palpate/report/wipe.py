@@ -92,6 +92,8 @@ class WipeReport:
     """time [s], kind, one sentence"""
     timing: Sequence[Mapping[str, str]] = ()
     """in words, all with the same keys"""
+    limited: bool = False
+    """some ink was meant to stay"""
     settings: Mapping[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -146,10 +148,11 @@ def _largest(values: Array) -> float:
 
 def _card(report: WipeReport) -> str:
     left = 100.0 * report.ink_left
+    what = "all ink, some of which was to stay," if report.limited else "the ink"
     colour = {"clean": "green", "dirty": "orange"}.get(report.verdict, "red")
     meaning = {"clean": "the camera sees no more ink that should go", "dirty": "some ink is left"}
     words = [
-        f'<div class="number">{number(left, 2)} <small>% of the ink left</small></div>',
+        f'<div class="number">{number(left, 2)} <small>% of {what} left</small></div>',
         f'<p><span class="pill" style="--tone:var(--{colour})">{escape(report.verdict)}</span>'
         f"{escape(report.reason or meaning.get(report.verdict, ''), 400)}</p>",
     ]

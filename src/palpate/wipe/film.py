@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..vision import annotated
 from .job import WipeJob
 from .result import Event, Look, Observer, Tick
 
@@ -80,10 +79,7 @@ class Film(Observer):
 
     def look(self, look: Look) -> None:
         """Keep the picture with what was seen in it."""
-        whole = annotated(look.image, look.sight)
-        if look.sight.board is not None:
-            whole = around(whole, look.sight.board.corners)
-        self._camera = cv2.resize(whole, CAMERA, interpolation=cv2.INTER_AREA)
+        self._camera = shown(look, CAMERA)
 
     def event(self, event: Event) -> None:
         """Keep the line."""
@@ -164,17 +160,32 @@ class Film(Observer):
                 cv2.polylines(part, [np.rint(line).astype(np.int32)], False, colour, 1, cv2.LINE_AA)
 
 
-def around(picture: Picture, corners: npt.NDArray[np.float64]) -> Picture:
-    """The part of a picture around a board, in the shape of CAMERA."""
-    h, w = picture.shape[:2]
-    extent = 1.5 * np.ptp(corners, axis=0)
-    height = min(
-        max(float(extent[1]), float(extent[0]) * CAMERA[1] / CAMERA[0]), h, w * CAMERA[1] / CAMERA[0]
-    )
-    size = np.array([height * CAMERA[0] / CAMERA[1], height])
-    low = np.clip(corners.mean(0) - 0.5 * size, 0.0, np.maximum([w, h] - size, 0.0)).astype(int)
-    high = low + np.maximum(size.astype(int), 1)
-    return picture[low[1] : high[1], low[0] : high[0]]
+def shown(look: Look, size: tuple[int, int]) -> Picture:
+    """What is around the board in a picture, of `size` (width, height) [pixel]: its outline, the ink in red, other
+    things in purple."""
+    h, w = look.image.shape[:2]
+    low, part = np.zeros(2), np.array([w, h], np.float64)
+    if look.sight.board is not None:
+        corners = look.sight.board.corners
+        extent = 1.4 * np.ptp(corners, axis=0)
+        wide = min(max(float(extent[0]), float(extent[1]) * size[0] / size[1]), w, h * size[0] / size[1])
+        part = np.array([wide, wide * size[1] / size[0]])
+        low = np.clip(corners.mean(0) - 0.5 * part, 0.0, [w, h] - part)
+    scale = size[0] / part[0], size[1] / part[1]
+    M = np.array([[scale[0], 0.0, -scale[0] * low[0]], [0.0, scale[1], -scale[1] * low[1]]])
+    picture = cv2.warpAffine(look.image, M, size, flags=cv2.INTER_AREA)
+    if look.sight.ink is not None:
+        ink = cv2.warpAffine(look.sight.ink.mask.astype(np.uint8), M, size, flags=cv2.INTER_NEAREST) > 0
+        picture[ink] = (0.35 * picture[ink] + 0.65 * np.array([40, 40, 255])).astype(np.uint8)
+        for thing in look.sight.ink.objects:
+            _outline(picture, (thing - low) * scale, (200, 60, 200))
+    if look.sight.board is not None:
+        _outline(picture, (look.sight.board.corners - low) * scale, (70, 180, 40))
+    return picture
+
+
+def _outline(picture: Picture, corners: npt.NDArray[np.float64], colour: tuple[int, int, int]) -> None:
+    cv2.polylines(picture, [np.rint(corners).astype(np.int32)], True, colour, 2, cv2.LINE_AA)
 
 
 def _text(page: Picture, words: str, at: tuple[int, int], colour: tuple[int, int, int], size: float) -> None:

@@ -63,6 +63,11 @@ class JobOptions:
             raise InputError(f"wiping: look_every must be >= 0 s, got {self.look_every!r}")
 
     @property
+    def limited(self) -> bool:
+        """Some ink may be meant to stay."""
+        return not (self.colour is None and self.within is None and self.without is None)
+
+    @property
     def motions(self) -> Motion:
         """`motion`, or the usual one at `speed`."""
         return self.motion or Motion(speed=self.speed, acceleration=0.25)

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 
 from ..report import WipeReport
-from ..vision import annotated
-from .film import around
+from .film import shown
 from .options import JobOptions
 from .result import JobResult, Look
 from .scene import BoardScene
@@ -19,8 +18,8 @@ BAND = 0.5, 1.0
 """half width within which the normal force should stay [N]: up to SLOW, and above"""
 SLOW = 0.15
 """[m/s]"""
-_SHOWN = 720
-"""width of a picture in the report [pixels]"""
+_SHOWN = (720, 405)
+"""width and height of a picture in the report [pixels]"""
 
 
 def band(options: JobOptions) -> float:
@@ -113,6 +112,7 @@ def report(result: JobResult, options: JobOptions, scene: BoardScene, title: str
             }
             for name, t in result.timing.items()
         ],
+        limited=options.limited,
         settings={
             "speed": f"{options.speed:g} m/s",
             "normal force": f"{options.normal_force:g} N",
@@ -132,14 +132,7 @@ def report(result: JobResult, options: JobOptions, scene: BoardScene, title: str
 def _jpeg(look: Look | None) -> bytes | None:
     if look is None:
         return None
-    picture = annotated(look.image, look.sight)
-    if look.sight.board is not None:
-        picture = around(picture, look.sight.board.corners)
-    scale = _SHOWN / picture.shape[1]
-    if scale < 1.0:
-        size = (_SHOWN, round(scale * picture.shape[0]))
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    return cv2.imencode(".jpg", shown(look, _SHOWN), [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
 
 
 def _milli(seconds: float) -> str:
