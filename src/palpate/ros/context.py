@@ -273,6 +273,7 @@ class Context:
             return
         self._closed = True
         self._topics.clear()
+        self._nodes.clear()
         del self._writer, self._reader, self.participant
         shared = _domains[self.domain]
         shared.users.remove(self)

@@ -57,7 +57,7 @@ class RosDriver(Driver):
         arguments: remappings.
 
     Raises:
-        DriverError: rate or patience is out of range; the arm's effort is not declared.
+        DriverError: rate or patience is out of range, or the arm of an LBR declares another effort than torque.
     """
 
     def __init__(

@@ -78,6 +78,14 @@ class TaskNode(Node):
         self, context: Context, arguments: RosArguments | None = None, *, quiet: bool = False
     ) -> None:
         super().__init__(self.task, context, arguments=arguments, quiet=quiet)
+        self.finished = False
+        try:
+            self._begin()
+        except BaseException:
+            Node.close(self)
+            raise
+
+    def _begin(self) -> None:
         self.arm_name: str = self._declare(
             "arm", "justina_left_arm", "name of a reference arm, a card or a URDF", fixed=True
         )
@@ -99,7 +107,6 @@ class TaskNode(Node):
         self.arm: Arm = self.scene.arm if assume else arm
         for sentence in self.scene.assumed if assume else ():
             self.log(sentence)
-        self.finished = False
         self._prepare()
         for remark in self.parameters.check_overrides():
             self.log(remark, level=30)
