@@ -22,6 +22,8 @@ TOOL = 0.12
 PEG_GAP = 0.0015
 """between peg and hole, on each side [m]"""
 _PANEL_MASS = 0.3
+_FIXTURE = 3000.0
+"""of the springs on which surface and block stand [N/m]"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,26 +110,60 @@ def find(
     return makers[name]()
 
 
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+def _sprung(
+    spec: Any,
+    name: str,
+    pos: tuple[float, float, float] | Array,
+    quat: tuple[float, float, float, float],
+    axes: tuple[tuple[float, float, float], ...],
+    stiffness: float,
+) -> Any:
+    """A weightless-looking body on springs of one stiffness [N/m] along its own axes."""
+    mj = mujoco()
+    body = spec.worldbody.add_body(name=name, pos=pos, quat=quat, gravcomp=1.0)
+    for k, axis in enumerate(axes):
+        slide = body.add_joint(name=f"{name}:{k}", axis=axis)
+        slide.type = mj.mjtJoint.mjJNT_SLIDE
+        slide.stiffness[0] = stiffness
+        slide.damping[0] = 2.0 * 0.3 * (stiffness * _PANEL_MASS) ** 0.5
+    return body
+
+
+def _box(
+    body: Any,
+    size: tuple[float, float, float],
+    pos: tuple[float, float, float],
+    rgba: tuple[float, float, float, float],
+    share: float = 1.0,
+) -> None:
+    """A box of half lengths `size` [m], with this share of the body's mass."""
+    body.add_geom(
+        type=mujoco().mjtGeom.mjGEOM_BOX,
+        size=size,
+        pos=pos,
+        mass=share * _PANEL_MASS,
+        rgba=rgba,
+        friction=(0.3, 0.005, 0.0001),
+        solref=(0.002, 1.0),
+    )
+
+
 def _wall(tip: Array, stiffness: float, press: float) -> Scene:
     gap = 0.05
 
     def build(spec: Any) -> None:
-        mj = mujoco()
-        panel = spec.worldbody.add_body(name="panel", pos=(tip[0] + gap + PROBE + 0.01, tip[1], tip[2]))
-        slide = panel.add_joint(name="panel", axis=(1.0, 0.0, 0.0))
-        slide.type = mj.mjtJoint.mjJNT_SLIDE
-        slide.stiffness[0] = stiffness
-        slide.damping[0] = 2.0 * 0.3 * (stiffness * _PANEL_MASS) ** 0.5
-        panel.gravcomp = 1.0
-        panel.add_geom(
-            name="panel",
-            type=mj.mjtGeom.mjGEOM_BOX,
-            size=(0.01, 0.1, 0.05),
-            mass=_PANEL_MASS,
-            rgba=(0.55, 0.68, 0.5, 1.0),
-            friction=(0.3, 0.005, 0.0001),
-            solref=(0.002, 1.0),
+        panel = _sprung(
+            spec,
+            "panel",
+            (tip[0] + gap + PROBE + 0.01, tip[1], tip[2]),
+            _UPRIGHT,
+            ((1.0, 0.0, 0.0),),
+            stiffness,
         )
+        _box(panel, (0.01, 0.1, 0.05), (0.0, 0.0, 0.0), (0.55, 0.68, 0.5, 1.0))
 
     deep = gap + press
     path = through(
@@ -142,20 +178,11 @@ def _surface(tip: Array, press: float) -> Scene:
     slope = 0.15  # [rad]
 
     def build(spec: Any) -> None:
-        mj = mujoco()
-        c, s = np.cos(0.5 * slope), np.sin(0.5 * slope)
+        quat = (float(np.cos(0.5 * slope)), 0.0, float(np.sin(0.5 * slope)), 0.0)
         normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
         touch = np.asarray(tip) - np.array([0.0, 0.0, gap + PROBE])
-        spec.worldbody.add_geom(
-            name="surface",
-            type=mj.mjtGeom.mjGEOM_BOX,
-            size=(0.4, 0.4, 0.02),
-            pos=touch - 0.02 * normal,
-            quat=(c, 0.0, s, 0.0),
-            rgba=(0.62, 0.56, 0.46, 1.0),
-            friction=(0.4, 0.005, 0.0001),
-            solref=(0.004, 1.0),
-        )
+        plate = _sprung(spec, "surface", touch - 0.01 * normal, quat, ((0.0, 0.0, 1.0),), _FIXTURE)
+        _box(plate, (0.25, 0.25, 0.01), (0.0, 0.0, 0.0), (0.62, 0.56, 0.46, 1.0))
 
     down = -gap - press
     fall = -np.tan(slope)
@@ -173,7 +200,7 @@ def _surface(tip: Array, press: float) -> Scene:
         "surface",
         f"trace a surface that falls by {np.degrees(slope):.0f} degrees, pressing lightly",
         build,
-        0,
+        1,
         None,
         path,
         13.5,
@@ -181,23 +208,17 @@ def _surface(tip: Array, press: float) -> Scene:
 
 
 def _peg(tip: Array) -> Scene:
-    gap, depth, off = 0.03, 0.03, 0.004
+    gap, depth, off = 0.03, 0.03, 0.008
 
     def build(spec: Any) -> None:
-        mj = mujoco()
-        hole = PROBE + PEG_GAP
-        width, top = 0.04, tip[2] - PROBE - gap
+        hole, width = PROBE + PEG_GAP, 0.04
+        axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        top = tip[2] - PROBE - gap
+        block = _sprung(spec, "block", (tip[0], tip[1], top - depth), _UPRIGHT, axes, _FIXTURE)
         for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             away = hole + width
             size = (width, 2.0 * width + hole, depth) if dx else (hole, width, depth)
-            spec.worldbody.add_geom(
-                type=mj.mjtGeom.mjGEOM_BOX,
-                size=size,
-                pos=(tip[0] + dx * away, tip[1] + dy * away, top - depth),
-                rgba=(0.5, 0.52, 0.58, 1.0),
-                friction=(0.2, 0.005, 0.0001),
-                solref=(0.004, 1.0),
-            )
+            _box(block, size, (dx * away, dy * away, 0.0), (0.5, 0.52, 0.58, 1.0), 0.25)
 
     # the hand misses the hole at first and slides into it
     path = through(
@@ -215,7 +236,7 @@ def _peg(tip: Array) -> Scene:
         "peg",
         f"put a peg into a hole {1e3 * PEG_GAP:g} mm wider on each side, missing it at first",
         build,
-        0,
+        3,
         None,
         path,
         14.0,

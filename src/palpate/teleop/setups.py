@@ -22,6 +22,8 @@ CONTACT_DAMPING = 30.0
 """of the device in contact [N s/m]: it makes up for the estimate's 6 ms and the line's 1 ms"""
 THRESHOLD = 5.0
 """of what is felt, in standard deviations [1]: at 1 kHz three are passed every third of a second"""
+ACCELERATION = 10.0
+"""of the slave's reference at most [m/s^2]: twice what a hand does, and what the arm's joints can follow"""
 REACH = 0.3
 """of the workspace to each side of the start [m]"""
 
@@ -141,6 +143,7 @@ def build(
             lower=tip - REACH,
             upper=tip + REACH,
             force_limit=100.0,
+            acceleration=ACCELERATION,
             threshold=THRESHOLD,
             coupling=coupling,
             motion_scale=motion_scale,

@@ -90,7 +90,7 @@ class MasterSide {
       const double before = coupled && !link_.returned() ? live_[i] : 0.0;
       live_[i] = 0.0;
       if (coupled) {
-        double F = s.force[i];
+        double F = c_.coupling == Coupling::position_position ? 0.0 : s.force[i];
         if (c_.coupling != Coupling::force_position) F += c_.stiffness[i] * (s.position[i] - x_[i]) + c_.damping[i] * (s.velocity[i] - v_[i]);
         live_[i] = g * std::clamp(F, -c_.force_limit[i], c_.force_limit[i]);
         const double room = g < 1.0 ? c_.resync_rate[i] * h : std::numeric_limits<double>::infinity();

@@ -92,13 +92,15 @@ class SlaveSide {
         started_ = true;
       } else {
         // the force went from one sample to the other while the reference moved: the dearer of the two is booked
-        double before = 0.0, after = 0.0, pushing = 0.0;
+        double before = 0.0, after = 0.0, pushing = 0.0, jump = 0.0;
         for (std::size_t i = 0; i < n_; ++i) {
           before += port_[i] * moved_[i];
           after += port[i] * moved_[i];
           pushing += pushed_[i] * (x[i] - x_[i]);
+          jump += 0.5 * c_.stiffness[i] * std::abs(moved_[i] * (moved_[i] - moved_before_[i]));
         }
-        const double work = std::min(before, after) - pushing;
+        // a damper jumps with the reference's velocity, at once, and neither sample shows it
+        const double work = std::min(before, after) - pushing - jump;
         tank_.exchange(power_scale * work);
       }
       x_ = x;
@@ -139,6 +141,12 @@ class SlaveSide {
       const double fastest = slowly ? std::min(c_.speed[i], c_.resync_speed[i] * (index ? g * g * g * g : 1.0)) : c_.speed[i];
       if (std::abs(wanted) > fastest) events |= event_speed;
       wanted = std::clamp(wanted, -fastest, fastest);
+      // towards the end of the workspace no faster than half the acceleration brakes: the arm comes to rest with its reference
+      const double ahead = std::max(0.0, wanted > 0.0 ? c_.upper[i] - reference_[i] : reference_[i] - c_.lower[i]);
+      if (std::isfinite(c_.acceleration[i]) && std::isfinite(ahead)) {
+        const double braked = std::sqrt(c_.acceleration[i] * ahead);
+        wanted = std::clamp(wanted, -braked, braked);
+      }
       apart = apart || std::abs(inside[i] - reference_[i]) > c_.resync_speed[i] / c_.gain;
       const double most = slowly ? std::min(c_.acceleration[i], c_.resync_acceleration[i]) : c_.acceleration[i];
       const double room = coupled ? most * h : std::numeric_limits<double>::infinity();
@@ -162,6 +170,7 @@ class SlaveSide {
       }
     }
     for (std::size_t i = 0; i < n_; ++i) {
+      moved_before_[i] = moved_[i];
       moved_[i] = step[i];
       reference_[i] += step[i];
       velocity_[i] = h > 0.0 ? step[i] / h : 0.0;
@@ -249,7 +258,7 @@ class SlaveSide {
   Link link_;
   FeltForce felt_;
   Message message_{};
-  JointVector x_{}, port_{}, reference_{}, velocity_{}, target_{}, last_{}, moved_{}, pushed_{};
+  JointVector x_{}, port_{}, reference_{}, velocity_{}, target_{}, last_{}, moved_{}, moved_before_{}, pushed_{};
   double allowed_ = 1.0;
   bool started_ = false, pointed_ = false, caught_ = false;
 };
