@@ -24,7 +24,9 @@ with Context(domain, localhost=True) as there, Node("listener", there, quiet=Tru
     node.subscribe(JointState, "joint_states", lambda message, writer: states.append(message))
     node.subscribe(Float64, "payload_mass", lambda message, writer: masses.append(message.data))
     node.subscribe(Float64, "payload_mass_std", lambda message, writer: spreads.append(message.data))
-    launched = Launch(graph("mass-estimation"), arguments, ["--domain", str(domain), "--localhost", "--quiet"])
+    launched = Launch(
+        graph("mass-estimation"), arguments, ["--domain", str(domain), "--localhost", "--quiet"]
+    )
     launched.start()
     try:
         node.spin_until(lambda: len(there.nodes()) == 7, timeout=100.0)
@@ -36,4 +38,6 @@ with Context(domain, localhost=True) as there, Node("listener", there, quiet=Tru
 print(f"joint_states: {len(states)} messages of {len(states[0].name)} joints")
 print("nodes:", ", ".join(name.removeprefix("/") for name in nodes))
 known = [mass for mass in masses if math.isfinite(mass)]  # what is not to be used is published as NaN
-print(f"the graph says {1000 * known[-1]:.0f} g, with a standard deviation below {math.ceil(1000 * spreads[-1])} g")
+print(
+    f"the graph says {1000 * known[-1]:.0f} g, with a standard deviation below {math.ceil(1000 * spreads[-1])} g"
+)

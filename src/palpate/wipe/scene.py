@@ -243,7 +243,7 @@ class BoardScene:
     @property
     def T_holder_base(self) -> Array:
         """(4, 4) from the base of the eraser's arm to that of the holder's."""
-        T: Array = np.linalg.inv(_holder_base())
+        T: Array = np.asarray(np.linalg.inv(_holder_base()), dtype=np.float64)
         return T
 
     @property
