@@ -439,7 +439,7 @@ class TestDeadline:
         with FriController(PORT) as controller, make(mode="torque", deadline=0.6) as driver:
             driver.enable()
             begun = len(controller.commands)
-            until(lambda: len(controller.commands) > begun + 200, 60.0)  # the program does nothing
+            until(lambda: len(controller.commands) > begun + 200)  # the program does nothing
             asleep = controller.commands[begun : begun + 200]
             assert all(c.torque is not None and not c.torque.any() for c in asleep)
             assert len({c.reflected for c in asleep}) == len(asleep), "a message was answered twice"
@@ -450,15 +450,15 @@ class TestDeadline:
             driver.enable()
             sample = following(driver)
             answered = len(controller.commands)
-            until(lambda: len(controller.commands) > answered + 3, 60.0)
+            until(lambda: len(controller.commands) > answered + 3)
             sent = driver.write(ARM.gravity_torque(sample.position) + 5.0)
             np.testing.assert_allclose(sent, ARM.gravity_torque(sample.position))
-            until(lambda: len(controller.commands) > answered + 10, 60.0)
+            until(lambda: len(controller.commands) > answered + 10)
             assert not any(c.torque is not None and c.torque.any() for c in controller.commands[answered:])
 
     def test_while_nothing_is_commanded_every_message_is_answered_at_once(self) -> None:
         with FriController(PORT, commanding=False) as controller, make(deadline=0.6):
-            until(lambda: len(controller.commands) > 100, 60.0)
+            until(lambda: len(controller.commands) > 100)
             assert all(c.position is None for c in controller.commands[:100])
             assert controller.stale == 0
 

@@ -14,7 +14,7 @@ from ..arm import Arm, Array
 from ..drivers import Driver
 from ..errors import DriverError
 from ..logs import Log, Sample
-from ..weigh.session import card_text
+from ..session import card_text
 from .arguments import RosArguments
 from .context import STREAM, Context
 from .messages import Float64MultiArray, Header, JointState, Time

@@ -57,8 +57,8 @@ def measure(seconds: float, rate: float, everything: bool, fifo: bool) -> dict[s
             controller=Controller(arm, *place.gains),
             record=file,
             realtime=Realtime() if fifo else Realtime(priority=0),
-            patience=1.0,
-            lease=30.0,
+            patience=10.0,  # a stall is to be counted, not to end the measurement
+            lease=60.0,
             buffer=20.0,
             allocation_counter=counter,
         ) as session:
