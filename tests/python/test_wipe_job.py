@@ -322,7 +322,7 @@ def test_a_stop_is_safe_and_what_is_left_is_wiped_later():
 @pytest.mark.slow
 def test_a_board_out_of_reach_is_told():
     ink = wipe.InkLayer((0.42, 0.30))
-    ink.stroke([[0.05, 0.03], [0.37, 0.03]], width=0.006)
+    ink.stroke([[0.15, 0.05], [0.25, 0.12]], width=0.006)
     scene = wipe.BoardScene(ink, wipe.Setting(centre=(0.80, 0.0, 0.15)))
     made().close()  # skips where there is no OpenGL
     result = run(scene)[2]

@@ -40,7 +40,7 @@ SAME = 0.012
 """two corners that went the same way differ in it by so much at most [m]"""
 LIKE = 0.75
 """correlation from which a corner is found"""
-SHAPE = 8.0
+SHAPE = 2.0
 """corners of a board found are so far at most from those of the nearest pose of a board of the right size [pixel]"""
 PATIENCE_NS = 2_000_000_000
 """for a torque channel to come back [ns]"""

@@ -109,7 +109,7 @@ struct CartesianCommand {
 ///   A_nn F_c + A_nw T_c = -A_np F_p - A_nw T,   A_wn F_c + A_ww T_c = -A_wp F_p,
 /// F_p the force in the plane, the surface's friction with it, so that nothing of F_p and T is left in the normal direction and nothing of F_p in turning; and
 /// -J^T A^-1 J'q', bounded as F and T are, takes away what the tool accelerates by the arm's own speed (part of the Coriolis
-/// compensation, not of F and T). F and T with what is added keep their bounds.
+/// compensation, not of F and T). F and T with what is added keep their bounds. All of it only while the surface is felt.
 ///
 /// A push (external force beyond yield_force, the contact's own force taken away) makes the arm yield: ABAGs and integral are
 /// cleared and F = 0 until it has been gone for yield_time. The tool keeps its orientation.
@@ -181,7 +181,7 @@ class CartesianVelocity {
     const Vec3<double> f = felt ? transposed(A, Arm::to_vec(external.force)) : Vec3<double>{};
     if (felt) out.contact_force = f.z;
     out.yielding = pushed(felt, f, target.normal_force);
-    const bool blind = pressing && !felt;
+    const bool blind = pressing && !felt, touches = f.z > 0.3 * target.normal_force;
 
     Vec3<double> F{}, T{}, wanted{};
     const Vec3<double> in_plane{h.x, h.y, pressing ? 0.0 : h.z};
@@ -198,7 +198,7 @@ class CartesianVelocity {
         wanted.z = 0.0;
         double F_n = normal_force(target.normal_force, f.z, v.z);
         F = bounded(c_.max_force * Vec3<double>{axis(0, wanted.x - v.x), axis(1, wanted.y - v.y), 0.0}, left_in_plane(F_n));
-        if (c_.decoupled) decouple(dynamics, A * Vec3<double>{F.x + f.x, F.y + f.y, 0.0}, A.cz, F_n, T);
+        if (c_.decoupled && touches) decouple(dynamics, A * Vec3<double>{F.x + f.x, F.y + f.y, 0.0}, A.cz, F_n, T);
         F = bounded(F, left_in_plane(F_n));
         F.z = F_n;
         F = bounded(F, c_.max_force);
@@ -220,7 +220,7 @@ class CartesianVelocity {
     const JointVector posture = posture_.torque(tool, dynamics, q, dq);
     for (std::size_t j = 0; j < n; ++j) tau[j] += friction[j] + posture[j];
     tool.add_wrench((c_.errata.turned_twice ? tool.R * (tool.R * F_base) : F_base) + D, T + dynamics.turning(D_turning), arm_->n(), tau);
-    if (pressing && c_.decoupled) straighten(tool, dynamics, tau);
+    if (pressing && c_.decoupled && touches) straighten(tool, dynamics, tau);
     if (!check::all_finite(tau, n)) {
       out.joints.torque = holding_;
       out.joints.status = Status::non_finite;
