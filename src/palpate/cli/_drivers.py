@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from ..errors import InputError, suggest
 
@@ -12,6 +14,70 @@ if TYPE_CHECKING:
     from ..arm import Arm
     from ..drivers import Driver
     from ..weigh import Session
+
+DriverName = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="A real arm instead of a simulated one: dynamixel, feetech, ur or fri; or ros, an arm that others "
+        "move and publish.",
+        show_default=False,
+    ),
+]
+Port = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PORT",
+        help="Its serial port, e.g. /dev/ttyUSB0; of fri the UDP port. [default for fri: 30200]",
+        show_default=False,
+    ),
+]
+Host = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Of its controller (ur, fri). [default for fri: whoever sends]",
+        show_default=False,
+    ),
+]
+Bus = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Which servo moves which joint. [default: ids 1, 2, ... in the order of the joints]",
+        show_default=False,
+    ),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option(
+        metavar="HZ",
+        help="Its control rate. [default: 250 for servos, 500 for ur and fri]",
+        show_default=False,
+    ),
+]
+Topic = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME", help="With --driver ros, where. [default: /joint_states]", show_default=False
+    ),
+]
+States = Annotated[
+    str | None,
+    typer.Option(
+        metavar="KIND",
+        help="With --driver ros, what: joint_state or lbr_state (lbr_fri_ros2_stack). [default: joint_state]",
+        show_default=False,
+    ),
+]
+Stamp = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CLOCK",
+        help="With --driver ros, whose time counts: header, or arrival if stamps are zero. [default: header]",
+        show_default=False,
+    ),
+]
 
 _OPTIONS = {
     "dynamixel": ("--port", "--bus"),

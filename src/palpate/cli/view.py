@@ -26,7 +26,7 @@ from ._common import (
     open_log,
     say,
 )
-from ._drivers import make_driver, make_watcher
+from ._drivers import Bus, DriverName, Host, Port, Stamp, States, Topic, make_driver, make_watcher
 
 if TYPE_CHECKING:
     from ..arm import Arm
@@ -95,39 +95,10 @@ def run(
         bool, typer.Option("--noise/--no-noise", help="Noise and quantisation of the simulated drives.")
     ] = True,
     seed: Annotated[int, typer.Option(metavar="N", help="Of the simulated noise.")] = 0,
-    driver: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="A real arm instead of a simulated one: dynamixel, feetech, ur, fri; or ros: one that others move and "
-            "that publishes its joints' states.",
-            show_default=False,
-        ),
-    ] = None,
-    port: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PORT",
-            help="Its serial port, e.g. /dev/ttyUSB0; of fri the UDP port. [default for fri: 30200]",
-            show_default=False,
-        ),
-    ] = None,
-    host: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Of its controller (ur, fri). [default for fri: whoever sends]",
-            show_default=False,
-        ),
-    ] = None,
-    bus: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Which servo moves which joint. [default: ids 1, 2, ... in the order of the joints]",
-            show_default=False,
-        ),
-    ] = None,
+    driver: DriverName = None,
+    port: Port = None,
+    host: Host = None,
+    bus: Bus = None,
     rate: Annotated[
         float | None,
         typer.Option(
@@ -136,28 +107,9 @@ def run(
             show_default=False,
         ),
     ] = None,
-    topic: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="With --driver ros, where. [default: /joint_states]", show_default=False
-        ),
-    ] = None,
-    states: Annotated[
-        str | None,
-        typer.Option(
-            metavar="KIND",
-            help="With --driver ros, what: joint_state or lbr_state. [default: joint_state]",
-            show_default=False,
-        ),
-    ] = None,
-    stamp: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CLOCK",
-            help="With --driver ros, whose time counts: header or arrival. [default: header]",
-            show_default=False,
-        ),
-    ] = None,
+    topic: Topic = None,
+    states: States = None,
+    stamp: Stamp = None,
     columns: Columns = None,
     effort: Effort = None,
     base: Base = None,

@@ -35,7 +35,20 @@ from ._common import (
     say,
     status_words,
 )
-from ._drivers import line_summary, line_words, make_driver, make_watcher
+from ._drivers import (
+    Bus,
+    DriverName,
+    Host,
+    Port,
+    Rate,
+    Stamp,
+    States,
+    Topic,
+    line_summary,
+    line_words,
+    make_driver,
+    make_watcher,
+)
 
 if TYPE_CHECKING:
     from ..arm import Arm
@@ -137,69 +150,14 @@ def run(
             show_default=False,
         ),
     ] = None,
-    driver: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="A real arm instead of a simulated one: dynamixel, feetech, ur or fri; or ros, an arm that others "
-            "move and publish.",
-            show_default=False,
-        ),
-    ] = None,
-    port: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PORT",
-            help="Its serial port, e.g. /dev/ttyUSB0; of fri the UDP port. [default for fri: 30200]",
-            show_default=False,
-        ),
-    ] = None,
-    host: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Of its controller (ur, fri). [default for fri: whoever sends]",
-            show_default=False,
-        ),
-    ] = None,
-    bus: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Which servo moves which joint. [default: ids 1, 2, ... in the order of the joints]",
-            show_default=False,
-        ),
-    ] = None,
-    rate: Annotated[
-        float | None,
-        typer.Option(
-            metavar="HZ",
-            help="Its control rate. [default: 250 for servos, 500 for ur and fri]",
-            show_default=False,
-        ),
-    ] = None,
-    topic: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="With --driver ros, where. [default: /joint_states]", show_default=False
-        ),
-    ] = None,
-    states: Annotated[
-        str | None,
-        typer.Option(
-            metavar="KIND",
-            help="With --driver ros, what: joint_state or lbr_state (lbr_fri_ros2_stack). [default: joint_state]",
-            show_default=False,
-        ),
-    ] = None,
-    stamp: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CLOCK",
-            help="With --driver ros, whose time counts: header, or arrival if stamps are zero. [default: header]",
-            show_default=False,
-        ),
-    ] = None,
+    driver: DriverName = None,
+    port: Port = None,
+    host: Host = None,
+    bus: Bus = None,
+    rate: Rate = None,
+    topic: Topic = None,
+    states: States = None,
+    stamp: Stamp = None,
     columns: Columns = None,
     effort: Effort = None,
     base: Base = None,

@@ -105,7 +105,7 @@ def build_rust(tree: Path, folder: Path) -> Path:
     cargo = shutil.which("cargo")
     if cargo is None:
         raise InputError("the ros2-client peer needs Rust's cargo 1.85 or later: https://rustup.rs")
-    command = [cargo, "build", "--release", "--quiet", "--locked", "--manifest-path", str(manifest)]
+    command = [cargo, "build", "--release", "--quiet", "--manifest-path", str(manifest)]
     _compiled(command, "the ros2-client peer", {"CARGO_TARGET_DIR": str(folder)})
     return folder / "release" / "rust_peer"
 
