@@ -27,7 +27,7 @@ def test_an_iiwa_moves_and_weighs(
 
     patient = partial(fri.FriDriver, address=LOCAL, deadline=math.inf, patience=30.0)
     monkeypatch.setattr(fri, "FriDriver", patient)
-    monkeypatch.setattr("palpate.cli._drivers.line_summary", lambda driver, session: {"lost": driver.lost})
+    monkeypatch.setattr("palpate.cli.weigh.line_summary", lambda driver, session: {"lost": driver.lost})
     goal = HOME + np.array([0.0, 0.1, 0.0, 0.1, 0.0, 0.0, 0.0])
     controller = FriController(PORT, arm=scene(IIWA).arm)  # with the rotors that palpate takes for granted
     controller.plant.attach(1.5)

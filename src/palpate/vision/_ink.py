@@ -33,7 +33,8 @@ THING = 0.016
 DARK = 0.5
 """a thing wider than a stroke takes away this part of the light at least, in one colour: no shadow is so deep"""
 PALE = 0.25
-"""a wide piece inside the board that takes away less of the light than this is a smudge, not a thing"""
+"""a wide piece inside the board that takes away less of the light than this, and is darker than what lies around, is a
+smudge, not a thing"""
 SPECK = 9
 """smallest connected piece [pixels]"""
 
@@ -79,7 +80,9 @@ def find(image: Image, corners: Array) -> Ink:
     clear = max(255.0 * CLEAR, middle + 1.6 * SIGMAS * noise)
     weak = ((taken > faint) & (below > 255.0 * BELOW) & (inside > 0)).astype(np.uint8)
     things = _things(below, inside, weak, size)
-    ink = _pieces(weak, taken, below, things, clear, corners - low, low, (height, width), shorter, edge / 2.0)
+    ink = _pieces(
+        board, weak, taken, below, things, clear, corners - low, low, (height, width), shorter, edge / 2.0
+    )
     found, _ = cv2.findContours(things, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     solid = tuple(3.0 * f.reshape(-1, 2) + 1.0 + low for f in found)
     return replace(ink, objects=ink.objects + solid)
@@ -134,7 +137,19 @@ def _level(board: Image, inside: Image) -> Image:
     return cv2.resize(wide, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
+def _darker(board: Image, weak: Image, piece: Mask, box: Array, strength: float) -> bool:
+    """Whether a piece is darker than the surface around it, rather than a gap between lights that shine on it."""
+    x, y, w, h = (int(v) for v in box)
+    reach = 2 * max(w, h)
+    window = np.s_[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
+    light = board[window].max(2)
+    around = light[(weak[window] == 0) & (light > 0)]
+    usual = float(np.percentile(around, 10)) if around.size else 0.0
+    return float(np.median(light[piece[window]])) < (1.0 - 0.5 * strength) * usual
+
+
 def _pieces(
+    board: Image,
     weak: Image,
     taken: Image,
     below: Image,
@@ -197,8 +212,11 @@ def _pieces(
     mass = np.cumsum(area[drawn])
     pen = float(radius[drawn[np.searchsorted(mass, 0.5 * mass[-1])]]) if len(drawn) else 0.0
     # a magnet, a sticker, an eraser, a hand: as wide as no stroke, and filled or reaching in from outside
-    bold = (filled > 0.9) & (strength > PALE)
-    thing = (radius > np.maximum(wide, 1.8 * pen)) & (bold | (nearest < margin + 3.0))
+    broad = radius > np.maximum(wide, 1.8 * pen)
+    bold = filled > 0.9
+    for i in np.flatnonzero(good & broad & bold & (strength < PALE)):
+        bold[i] = not _darker(board, weak, label == i + 1, stats[i + 1, :4], float(strength[i]))
+    thing = broad & (bold | (nearest < margin + 3.0))
     polygons, objects, contrast = [], [], []
     for i, (piece, line) in outlines.items():
         if thing[i]:
