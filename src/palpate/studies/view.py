@@ -88,6 +88,7 @@ def run(
     finally:
         source.stop()
         page.close()
+    progress(int(seconds) + 1, int(seconds) + 1, 0.0)
     time_s, mb = np.array(memory).T
     settled = time_s >= 0.1 * seconds
     growth = (
