@@ -62,7 +62,7 @@ $(VENV)/.sources: FORCE | $(VENV)/.tools
 
 # A real install, not an editable one: what is tested is what users get, a forgotten data file included.
 install = @echo "installing palpate[$(1)]" && PATH="$(abspath $(BIN)):$$PATH" \
-  $(PIP_INSTALL) --no-build-isolation -Cbuild-dir='build/{wheel_tag}$(3)' $(2) ".[$(1)]"
+  $(PIP_INSTALL) --no-build-isolation --config-settings=build-dir='build/{wheel_tag}$(3)' $(2) ".[$(1)]"
 $(VENV)/.all: $(SOURCES) $(VENV)/.sources | $(VENV)/.tools
 	$(call install,all)
 	@touch $@
@@ -74,7 +74,7 @@ $(VENV)/.bench: $(VENV)/.all
 	$(call install,bench)
 	@touch $@
 comma := ,
-strict = -Ccmake.define.PALPATE_WERROR=ON
+strict = --config-settings=cmake.define.PALPATE_WERROR=ON
 
 dev: $(VENV)/.tools
 	$(call install,dev,$(strict) --editable,-strict)
@@ -123,7 +123,7 @@ docs: $(VENV)/.test
 wheel: $(VENV)/.test
 	@rm -rf dist
 	@PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation \
-	  -Cbuild-dir='build/{wheel_tag}-strict' $(strict) -w dist .
+	  --config-settings=build-dir='build/{wheel_tag}-strict' $(strict) -w dist .
 	$(BIN)/python scripts/check_wheel.py dist/*.whl
 
 bench: $(VENV)/.bench
