@@ -142,7 +142,7 @@ def run(
     film = None if frames is None else _Film(make_folder(frames))
     pipeline, _ = weighing.make_pipeline(scene.arm)
     with interruptible() as stopped, _progress(task, json or quiet) as progress:
-        session = weighing.run(
+        trial = weighing.run(
             task,
             pipeline,
             record=out,
@@ -154,14 +154,14 @@ def run(
         )
     files = {"log": str(out)}
     if png is not None:
-        if session.picture is None:
-            raise InputError(f"--png: {session.picture_error}")
-        write_file(png, picture_png(session.picture))
+        if trial.picture is None:
+            raise InputError(f"--png: {trial.picture_error}")
+        write_file(png, picture_png(trial.picture))
         files["picture"] = str(png)
     if film is not None:
         files["frames"] = str(frames)
-    result = weighing.weigh_session(session)
-    log = session.log
+    result = weighing.weigh_trial(trial)
+    log = trial.log
     if json:
         emit(
             {
@@ -173,7 +173,7 @@ def run(
                 "frames": 0 if film is None else film.count,
                 "seed": seed,
                 "remarks": list(result.remarks),
-                "interrupted": session.interrupted,
+                "interrupted": trial.interrupted,
                 "files": files,
             }
         )
@@ -185,7 +185,7 @@ def run(
                 say(f"! {remark}")
         for name in files.values():
             say(name)
-    return STOPPED if session.interrupted else 0
+    return STOPPED if trial.interrupted else 0
 
 
 def _load(text: str) -> tuple[float, float]:

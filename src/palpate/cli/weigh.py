@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from ..arm import Arm
     from ..drivers import Driver
     from ..logs import Log
-    from ..weigh import Session, Task, Weighing
+    from ..weigh import Task, Trial, Weighing
 
 _DEFAULT_ARM = "justina_left_arm"
 
@@ -250,9 +250,9 @@ def run(
                 rate=1e9 / hardware.period_ns,
             )
             pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer)
-            session = _session(task, pipeline, target, live=live, pose=name, picture=False, driver=hardware)
-        result = weighing.weigh_session(session, pose=name)
-        on_bus = line_summary(hardware, session)
+            trial = _trial(task, pipeline, target, live=live, pose=name, picture=False, driver=hardware)
+        result = weighing.weigh_trial(trial, pose=name)
+        on_bus = line_summary(hardware, trial)
         if target is not None:
             files["log"] = str(target)
         title = f"What {scene.arm.name} holds"
@@ -274,18 +274,16 @@ def run(
         )
         pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer)
         target = _recording(out) if record else None
-        session = _session(
-            task, pipeline, target, live=live, pose=name, picture=report or picture is not None
-        )
-        result = weighing.weigh_session(session, pose=name)
+        trial = _trial(task, pipeline, target, live=live, pose=name, picture=report or picture is not None)
+        result = weighing.weigh_trial(trial, pose=name)
         if target is not None:
             files["log"] = str(target)
-        if session.picture is not None:
-            scene_png = picture_png(session.picture)
+        if trial.picture is not None:
+            scene_png = picture_png(trial.picture)
         elif picture is not None:
-            raise InputError(f"{picture} cannot be drawn: {session.picture_error or 'the run was stopped'}")
-        elif session.picture_error and not (json or quiet):
-            say(f"no picture: {session.picture_error}")
+            raise InputError(f"{picture} cannot be drawn: {trial.picture_error or 'the run was stopped'}")
+        elif trial.picture_error and not (json or quiet):
+            say(f"no picture: {trial.picture_error}")
         title = f"{scene.arm.name} weighs {held:g} kg"
     if report or picture is not None:
         from ..report import hero_picture, write_weigh_report
@@ -329,7 +327,7 @@ def _recording(out: Path) -> Path:
     return target
 
 
-def _session(
+def _trial(
     task: Task,
     pipeline: Any,
     target: Path | None,
@@ -338,15 +336,15 @@ def _session(
     pose: str,
     picture: bool,
     driver: Driver | None = None,
-) -> Session:
-    from ..weigh import run as run_session
+) -> Trial:
+    from ..weigh import run as run_trial
     from ._live import LiveTable, interruptible
 
     with interruptible() as stopped:
         if not live:
-            return run_session(task, pipeline, driver=driver, record=target, stop=stopped, picture=picture)
+            return run_trial(task, pipeline, driver=driver, record=target, stop=stopped, picture=picture)
         with LiveTable(task, pose) as table:
-            return run_session(
+            return run_trial(
                 task,
                 pipeline,
                 driver=driver,

@@ -52,8 +52,8 @@ def measure(seconds: float, corrupt: float, dead: int) -> dict[str, Any]:
             )
             pipeline, _ = weigh.make_pipeline(place.arm)
             try:
-                session = weigh.run(task, pipeline, driver=driver)
-                log, payload = session.log, session.touch.payload
+                trial = weigh.run(task, pipeline, driver=driver)
+                log, payload = trial.log, trial.touch.payload
                 ok = payload.status == int(Status.ok)
                 error = np.abs(payload.mass - MASS)
                 found |= {
