@@ -545,14 +545,14 @@ def measure(job: str) -> list[Row]:
 
 
 def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure], list[str]]:
-    """Measure; the time is taken alone, with nothing else running."""
+    """Measure; the time is taken first and alone, in a process that has loaded no rival yet."""
     jobs = list(_QUICK if quick else _JOBS)
     begin = time.perf_counter()
     alone = [] if quick else ["time"]
     with Work(progress, len(jobs)) as work:
-        first = work.map(measure, [job for job in jobs if job not in alone])
-        last = work.map(measure, alone)
-    found = dict(zip([*(job for job in jobs if job not in alone), *alone], [*first, *last], strict=True))
+        order = [*alone, *(job for job in jobs if job not in alone)]
+        results = [*work.map(measure, alone), *work.map(measure, order[len(alone) :])]
+    found = dict(zip(order, results, strict=True))
     rows = [row for job in jobs for row in found[job]]
     return rows, {}, [
         f"Measured in {time.perf_counter() - begin:.0f} s. Fits use the defaults of palpate.identify unless a row says "
