@@ -215,6 +215,13 @@ def test_files_of_others_are_not_replaced(palpate, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arguments, words",
     [
+        ("weigh justina_left_arm", "given as --arm justina_left_arm"),
+        ("view kuka_lbr_iiwa7", "given as --arm kuka_lbr_iiwa7"),
+        ("feel arm.urdf --arm justina_left_arm", "given as --arm arm.urdf"),
+        *(
+            (f"{verb} --seed -1", "--seed")
+            for verb in ("weigh", "simulate", "view", "wipe", "teleop", "excite")
+        ),
         ("weigh --pose Tkae3", "did you mean 'Take3'"),
         ("weigh --pose 1,2", "has 7 joints, got 2 angles"),
         ("weigh --pose 9,0,0,0,0,0,0", "outside its limits"),

@@ -172,11 +172,26 @@ def is_text(content: bytes) -> bool:
     return b"palpate" in content
 
 
+def a_log(path: Path) -> Path:
+    """What is given as LOG, unless it is an arm.
+
+    Raises:
+        InputError: the name of a reference arm and no file, or a card or URDF.
+    """
+    from .. import robots
+
+    if (str(path) in robots.names() and not path.exists()) or path.suffix.lower() in (".urdf", ".xacro"):
+        raise InputError(
+            f"{path} is an arm, and a recording is expected here; an arm is given as --arm {path}"
+        )
+    return path
+
+
 def open_log(path: Path, columns: str | None) -> Log:
     """The log, bad rows kept: the pipeline gives them a status."""
     from ..logs import Log
 
-    return Log.open(path, column_map(columns), keep_invalid=True)
+    return Log.open(a_log(path), column_map(columns), keep_invalid=True)
 
 
 def column_map(text: str | None) -> ColumnMap | None:

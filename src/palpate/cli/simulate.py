@@ -87,7 +87,7 @@ def run(
     ] = True,
     jitter: Annotated[float, typer.Option(metavar="S", help="Error of the time stamps, up to.")] = 0.0,
     loss: Annotated[float, typer.Option(metavar="P", help="Probability that a sample is lost.")] = 0.0,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of noise, jitter and loss.")] = 0,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of noise, jitter and loss.")] = 0,
     speed: Annotated[
         float | None,
         typer.Option(

@@ -18,6 +18,7 @@ from ._common import (
     Quiet,
     Repair,
     Tip,
+    a_log,
     emit,
     examples,
     make_folder,
@@ -94,7 +95,7 @@ def run(
     noise: Annotated[
         bool, typer.Option("--noise/--no-noise", help="Noise and quantisation of the simulated drives.")
     ] = True,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of the simulated noise.")] = 0,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the simulated noise.")] = 0,
     driver: DriverName = None,
     port: Port = None,
     host: Host = None,
@@ -138,6 +139,7 @@ def run(
     from ._live import interruptible
 
     if log is not None:
+        a_log(log)
         only("a simulation", "LOG is a recording", {"--mass": mass, "--pose": pose})
         only("a live arm", "LOG is a recording", {"--driver": driver, "--rate": rate})
     else:

@@ -18,6 +18,7 @@ from ._common import (
     Quiet,
     Repair,
     Tip,
+    a_log,
     check_target,
     console,
     emit,
@@ -136,7 +137,8 @@ def run(
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(metavar="N", help="Of the simulated noise; the same seed gives the same run.")
+        int,
+        typer.Option(metavar="N", min=0, help="Of the simulated noise; the same seed gives the same run."),
     ] = 0,
     duration: Annotated[float, typer.Option(metavar="S", help="How long to simulate.")] = 10.0,
     noise: Annotated[
@@ -181,6 +183,7 @@ def run(
     from .. import weigh as weighing
 
     if log is not None:
+        a_log(log)
         given = {"--mass": mass, "--pose": pose, "--start": start, "--speed": speed, "--picture": picture}
         only("a simulation", "LOG is a recording", given)
         only("a real arm", "LOG is a recording", {"--driver": driver})

@@ -70,7 +70,8 @@ def add(app: typer.Typer) -> None:
 
 def run(
     seed: Annotated[
-        int, typer.Option(metavar="N", help="Of board, light and noise; the same seed gives the same run.")
+        int,
+        typer.Option(metavar="N", min=0, help="Of board, light and noise; the same seed gives the same run."),
     ] = 0,
     ink: Annotated[
         Path | None,
