@@ -10,10 +10,13 @@ import typer
 from ..errors import InputError
 from . import STOPPED
 from ._common import (
+    DEFAULT_ARM,
     Base,
     Json,
+    Noise,
     Quiet,
     Repair,
+    Seed,
     Tip,
     check_target,
     console,
@@ -54,7 +57,7 @@ def add(app: typer.Typer) -> None:
 def run(
     arm: Annotated[
         str, typer.Option(metavar="ARM", help="Name of a reference arm, a card or a URDF.")
-    ] = "justina_left_arm",
+    ] = DEFAULT_ARM,
     pose: Annotated[
         list[str] | None,
         typer.Option(
@@ -82,12 +85,10 @@ def run(
     ] = 3.0,
     hold: Annotated[float, typer.Option(metavar="S", help="Time at each pose but the last.")] = 2.0,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Samples per second.")] = 250.0,
-    noise: Annotated[
-        bool, typer.Option("--noise/--no-noise", help="Noise and quantisation of the drives.")
-    ] = True,
+    noise: Noise = True,
     jitter: Annotated[float, typer.Option(metavar="S", help="Error of the time stamps, up to.")] = 0.0,
     loss: Annotated[float, typer.Option(metavar="P", help="Probability that a sample is lost.")] = 0.0,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of noise, jitter and loss.")] = 0,
+    seed: Seed = 0,
     speed: Annotated[
         float | None,
         typer.Option(

@@ -14,6 +14,7 @@ from . import STOPPED
 from ._common import (
     Json,
     Quiet,
+    Seed,
     check_target,
     console,
     emit,
@@ -112,7 +113,7 @@ def run(
         float | None,
         typer.Option(metavar="S", help="How long. [default: as long as the scene takes]", show_default=False),
     ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of noise and faults.")] = 0,
+    seed: Seed = 0,
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for report.html and teleop.mcap.")
     ] = Path("teleop"),

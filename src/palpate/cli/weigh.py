@@ -11,12 +11,17 @@ import typer
 from ..errors import InputError
 from . import STOPPED
 from ._common import (
+    DEFAULT_ARM,
+    ArmOrRecorded,
     Base,
     Columns,
     Effort,
     Json,
+    Noise,
     Quiet,
+    RecordedLog,
     Repair,
+    Seed,
     Tip,
     a_log,
     check_target,
@@ -57,8 +62,6 @@ if TYPE_CHECKING:
     from ..logs import Log
     from ..weigh import Task, Trial, Weighing
 
-_DEFAULT_ARM = "justina_left_arm"
-
 
 def add(app: typer.Typer) -> None:
     """Make the verb known."""
@@ -85,23 +88,8 @@ def add(app: typer.Typer) -> None:
 
 
 def run(
-    log: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="LOG",
-            help="A recording: .mcap, rosbag2 folder, .csv, .npz. Without it an arm is simulated.",
-            show_default=False,
-        ),
-    ] = None,
-    arm: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ARM",
-            help=f"Name of a reference arm (see palpate arm), a card or a URDF. [default: {_DEFAULT_ARM}, or "
-            "the one palpate recorded in LOG]",
-            show_default=False,
-        ),
-    ] = None,
+    log: RecordedLog = None,
+    arm: ArmOrRecorded = None,
     mass: Annotated[
         float | None,
         typer.Option(metavar="KG", help="Mass to lift. [default: 0.25 for Justina]", show_default=False),
@@ -136,14 +124,9 @@ def run(
             show_default=False,
         ),
     ] = None,
-    seed: Annotated[
-        int,
-        typer.Option(metavar="N", min=0, help="Of the simulated noise; the same seed gives the same run."),
-    ] = 0,
+    seed: Seed = 0,
     duration: Annotated[float, typer.Option(metavar="S", help="How long to simulate.")] = 10.0,
-    noise: Annotated[
-        bool, typer.Option("--noise/--no-noise", help="Noise and quantisation of the drives.")
-    ] = True,
+    noise: Noise = True,
     speed: Annotated[
         float | None,
         typer.Option(
@@ -262,7 +245,7 @@ def run(
     else:
         if mass is not None:
             weighing.check_mass(mass)
-        scene = weighing.scene(open_arm(arm or _DEFAULT_ARM, base=base, tip=tip, repair=repair), mass=mass)
+        scene = weighing.scene(open_arm(arm or DEFAULT_ARM, base=base, tip=tip, repair=repair), mass=mass)
         name, goal = weighing.find_pose(scene, pose or scene.pose)
         held = scene.mass if mass is None else mass
         task = weighing.Task(
