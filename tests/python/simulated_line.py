@@ -1,4 +1,4 @@
-"""A serial line in simulated time: the real SDK at one end, emulated servos at the other, no thread, no clock but its own.
+"""A serial line in simulated time: the real SDK at one end, emulated servos at the other, no thread, no real clock.
 
 Every byte takes its time on the wire, the adapter its delay, each look of the program at the line or the clock a little
 computing. A run is the same on any computer, however busy, and says what the protocol itself needs.

@@ -77,12 +77,15 @@ class ServoDriver(Driver):
     A period is one question to all servos and their answers, in the order of the bus. Answers that are damaged are
     thrown away and those servos asked once more, their positions taken back to the moment of the rest by their speeds;
     where one does not answer then, or too late for that, the sample is lost: read() returns None and
-    :attr:`statistics` counts it. A servo is dead that leaves the question to all and two to itself without any
-    answer while another servo answers a later question: a bus keeps the order, so the line is well, and no delay of
-    this computer looks like that. So is one without a good answer for `patience` periods in a row. Either is a
-    DriverError with its id, and the drives are stopped. How long an answer is waited for follows from what the bus needed of late.
-    The time of a sample is the middle between question and last
-    answer. Velocity is in the samples if the arm's card states its deviation for every joint; servos filter it.
+    :attr:`statistics` counts it. How long an answer is waited for follows from what the bus needed of late.
+
+    A servo is dead that leaves the question to all and two to itself without any answer while another servo answers a
+    later question: a bus keeps the order, so the line is well, and no delay of this computer looks like that. So is
+    one without a good answer for `patience` periods in a row. Either is a DriverError with its id, and the drives are
+    stopped.
+
+    The time of a sample is the middle between question and last answer. Velocity is in the samples if the arm's card
+    states its deviation for every joint; servos filter it.
 
     Args:
         arm: the arm.
