@@ -915,7 +915,7 @@ class TestBoard:
             assert not node.finished and boards == ["dirty"]
             assert doing[0] == "parking"
             steps = np.diff([m.header.stamp.time_ns for m in joints])
-            assert len(joints) > 5 and set(steps) == {50_000_000}
+            assert len(joints) > 5 and np.abs(steps - 50_000_000).max() <= 4_000_000  # of whole cycles
             assert tuple(joints[0].name) == node.job.scene.arms[0].joint_names
 
     @pytest.mark.parametrize(
