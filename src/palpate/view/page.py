@@ -18,6 +18,7 @@ from ..errors import InputError, MissingExtraError, PalpateError
 from ..pipeline import ESTIMATORS, OBSERVERS
 from ..report._style import LIGHT
 from ..report._text import escape, number
+from ._guard import guarded
 from .scene import (
     Badge,
     Channels,
@@ -124,7 +125,7 @@ class Page:
     ) -> None:
         viser = _viser()
         check_address(host, port)
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets with a table of its own
+        with contextlib.redirect_stdout(io.StringIO()), guarded(host):  # it greets with a table of its own
             self._server: ViserServer = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         if port not in (0, self._server.get_port()):
             self._server.stop()
