@@ -78,11 +78,11 @@ def guarded(listen: str) -> Iterator[None]:
 
         return real(*given, **{**options, "process_request": process, "max_size": LARGEST})
 
-    server.serve = serve  # type: ignore[assignment, misc]  viser takes no such options
+    vars(server)["serve"] = serve  # viser takes no such options
     try:
         yield
     finally:
-        server.serve = real  # type: ignore[misc]
+        vars(server)["serve"] = real
     if not used:
         _logger.warning(
             "this version of viser starts its server in another way: strangers' pages are not refused"
