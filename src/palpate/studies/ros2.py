@@ -23,9 +23,9 @@ import numpy as np
 
 from ..errors import InputError, PalpateError
 from ..ros import Context, Node, Reliability
+from ..ros.graphs import GRAPHS, TASKS
 from ..ros.launch import Launch, graph
 from ..ros.messages import Header, InertiaStamped, JointState, JointTrajectory, Time
-from ..ros.tasks import TASKS
 from ..weigh import Task, load_arm, make_pipeline, scene
 from ..weigh import run as run_trial
 from . import Progress, Row
@@ -230,7 +230,7 @@ def weigh_by_graph(domain: int, seconds: float, seed: int) -> tuple[float, float
     """Mass [kg] that the launched graph tells last, and that of a trial in this process."""
     arm = scene(load_arm("justina_left_arm"))
     masses: list[float] = []
-    readers = 1 + sum(node.reads_samples for node in TASKS.values())
+    readers = 1 + sum(TASKS[node].reads_samples for node in GRAPHS["mass-estimation"])
     with Context(domain, localhost=True) as there, Node("palpate_bench", there, quiet=True) as node:
         node.subscribe(JointState, "joint_states", lambda m, w: None)
         node.subscribe(InertiaStamped, "payload", lambda m, w: masses.append(m.inertia.m))
