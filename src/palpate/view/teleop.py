@@ -298,7 +298,8 @@ class TeleopPage:
     def _say(self, run: Run, k: int) -> None:
         events = Event(int(run.master_events[k] | run.slave_events[k]))
         reasons = [text for at, text in run.reasons[-1:] if run.holding]
-        words = "; ".join([*reasons, *filter(None, [event_words(events)])]) or "coupled"
+        others = event_words(events & ~(Event.LINK | Event.WORKSPACE)) if reasons else event_words(events)
+        words = "; ".join(filter(None, [*reasons, others])) or "coupled"
         dead = bool(events & Event.LINK)
         tone = "#c43b1d" if dead else "#b07a00" if reasons or events else "#007a4d"
         f, true, felt = self.faults, np.linalg.norm(run.true[k]), np.linalg.norm(run.felt[k])
@@ -319,7 +320,8 @@ class TeleopPage:
         """End the page."""
         self._over.set()
         self._thread.join()
-        self._server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
 
 
 def _box_type() -> int:
