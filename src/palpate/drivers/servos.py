@@ -314,6 +314,7 @@ class ServoDriver(Driver):
             if not patient:
                 self._hurry()
             out.append(servo)
+            only = out.count(servo) == 1  # what it answers is this question, not one before
             answers = self._collect(out)
             self._hear_complaints(answers)
             found |= {i: r.before(1e-9 * (self._heard_ns - middle)) for i, r in answers.items()}
@@ -324,7 +325,7 @@ class ServoDriver(Driver):
                 self._count(unanswered=1)
                 if 0 < out.count(servo) < _SURE:
                     queue.appendleft(servo)
-            elif out:
+            elif out and only:
                 dead = [s for s in self._servos if out.count(s.id) >= _SURE]
                 if dead:
                     raise DriverError(
@@ -333,7 +334,8 @@ class ServoDriver(Driver):
                 queue.extendleft(i for i in dict.fromkeys(out) if i not in queue)
             if out and not queue and not patient:
                 patient = True
-                queue.extend([*well, *found][:1] or again)
+                # one that is well shows whether the line is; if not, all of it may be late
+                queue.extend([*[*well, *found][:1], *again])
         return {i: reading for i, reading in found.items() if i in again}
 
     def _hurry(self) -> None:
