@@ -76,6 +76,10 @@ class SimulatedLine:
     def close(self) -> None:
         pass
 
+    @property
+    def in_waiting(self) -> int:
+        return sum(len(data) for at, data in self._coming if at <= self.now_ns)
+
     def reset_input_buffer(self) -> None:
         self._coming = [(at, data) for at, data in self._coming if at > self.now_ns]
 

@@ -13,7 +13,7 @@ from ..errors import DriverError
 
 GRACE_MS = 10.0
 """how long an answer may take beyond its time on the wire [ms]: the servo's own delay, USB, this computer"""
-GAP_MS = 2.0
+GAP_MS = 1.7
 """the same from one answer to the next [ms]"""
 _WRITE_S = 0.2
 _logger = logging.getLogger(__name__)
@@ -34,6 +34,9 @@ def open_port(handler: type, path: str, baud: int) -> Any:
 
     class Port(handler):  # type: ignore[misc]
         """What the SDK's own does by polling at full load, by the wall's clock and without emptying the line."""
+
+        unread = 0
+        """bytes that came too late and were thrown away"""
 
         def readPort(self, length: int) -> bytes:
             rest = (self.packet_timeout - self.getTimeSinceStart()) * 1e-3
@@ -56,6 +59,7 @@ def open_port(handler: type, path: str, baud: int) -> Any:
 
         def clearPort(self) -> None:
             # a late answer to an earlier question must not be taken for the answer to this one
+            self.unread += self.ser.in_waiting
             self.ser.reset_input_buffer()
 
     latency = _usb_latency_ms(path)

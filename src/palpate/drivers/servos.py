@@ -77,7 +77,8 @@ class ServoDriver(Driver):
     A period is one question to all servos and their answers, in the order of the bus. Answers that are damaged are
     thrown away and those servos asked once more, their positions taken back to the moment of the rest by their speeds;
     where one does not answer then, or too late for that, the sample is lost: read() returns None and
-    :attr:`statistics` counts it. How long an answer is waited for follows from what the bus needed of late.
+    :attr:`statistics` counts it. A servo that is asked alone is waited for as long as the bus needed of late; as soon
+    as a second one is silent too, for 10 ms.
 
     A servo is dead that leaves the question to all and two to itself without any answer while another servo answers a
     later question: a bus keeps the order, so the line is well, and no delay of this computer looks like that. So is
@@ -188,7 +189,6 @@ class ServoDriver(Driver):
         try:
             self._find_servos()
             self._prepare()
-            self._most_gap_ms: float = self._port.gap_ms
             self._disable()
         except BaseException:
             self._close()
@@ -238,7 +238,6 @@ class ServoDriver(Driver):
         begin, behind = time.monotonic_ns(), 0
         with self._talking():
             self._everybody.txPacket()
-            self._hurry()
             found = self._collect(self._ids)
             middle = (begin + self._heard_ns) // 2
             self._unsettled = self._timed_out
@@ -292,11 +291,10 @@ class ServoDriver(Driver):
             raise DriverError(f"{self._path}: the connection is gone: {_words(error)}") from None
 
     def _learn_delay(self, took_ms: float) -> None:
-        """What the bus needs beyond the bytes' time on the wire: the longest of late."""
+        """What the bus needs beyond the bytes' time on the wire [ms]: the longest of late."""
         count = len(self._ids)
         delay = took_ms - self._port.tx_time_per_byte * (14 + count + count * self._answer_length)
         self._delay_ms = max(delay, min(self._delay_ms, self._port.grace_ms) * (1.0 - 1.0 / _CALM))
-        self._port.gap_ms = min(self._most_gap_ms, max(self._delay_ms, 0.5))
 
     def _ask_again(self, again: Sequence[int], well: Sequence[int], middle: int) -> dict[int, Reading]:
         """The servos that gave no good answer to the question to all, one by one; positions as of `middle` [ns].
@@ -307,12 +305,15 @@ class ServoDriver(Driver):
         found: dict[int, Reading] = {}
         queue = deque(again)
         out: list[int] = []  # asked, and not a byte heard since
-        patient = False
+        patient = ended = False
         while queue:
             servo = queue.popleft()
+            unread = self._port.unread
             self._packets.readTx(self._port, servo, *self._block)
             if not patient:
                 self._hurry()
+            if self._port.unread > unread:
+                out.clear()  # late answers, whoever's, were thrown away before the question
             out.append(servo)
             only = out.count(servo) == 1  # what it answers is this question, not one before
             answers = self._collect(out)
@@ -323,6 +324,8 @@ class ServoDriver(Driver):
             if servo not in answers:
                 self._unsettled = True
                 self._count(unanswered=1)
+                # a second silent one: the line may be late, and more questions would make it later
+                patient = patient or len(set(out)) > 1
                 if 0 < out.count(servo) < _SURE:
                     queue.appendleft(servo)
             elif out and only:
@@ -332,10 +335,10 @@ class ServoDriver(Driver):
                         f"{self._path}: {_names(dead)} did not answer {_SURE + 1} times, and then servo {servo} did"
                     )
                 queue.extendleft(i for i in dict.fromkeys(out) if i not in queue)
-            if out and not queue and not patient:
-                patient = True
-                # one that is well shows whether the line is; if not, all of it may be late
-                queue.extend([*[*well, *found][:1], *again])
+            if out and not queue and not ended:
+                # one that is well shows whether the line is
+                queue.extend([*[*well, *found][:1], *(() if patient else again)])
+                patient = ended = True
         return {i: reading for i, reading in found.items() if i in again}
 
     def _hurry(self) -> None:
