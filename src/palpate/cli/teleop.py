@@ -55,7 +55,7 @@ def run(
         str, typer.Argument(metavar="[SCENE]", help="wall, surface, peg, lift or free.", show_default=False)
     ] = "wall",
     arm: Annotated[
-        str, typer.Option(metavar="ARM", help="The slave: kuka_lbr_iiwa14 or kuka_lbr_iiwa7.")
+        str, typer.Option(metavar="ARM", help="The slave: kuka_lbr_iiwa14, kuka_lbr_iiwa7 or abb_irb2400_16.")
     ] = "kuka_lbr_iiwa14",
     coupling: Annotated[
         str,
@@ -71,13 +71,18 @@ def run(
         list[float] | None,
         typer.Option(
             metavar="KG",
-            help="Object to lift; again for the next one. [default: 0.5 1.2]",
+            help="Object to lift; again for the next one. [default: what suits the arm]",
             show_default=False,
         ),
     ] = None,
     motion_scale: Annotated[
-        float, typer.Option(metavar="S", help="Motion of the arm per motion of the hand.")
-    ] = 1.0,
+        float | None,
+        typer.Option(
+            metavar="S",
+            help="Motion of the arm per motion of the hand. [default: what suits the arm]",
+            show_default=False,
+        ),
+    ] = None,
     force_scale: Annotated[
         float | None,
         typer.Option(
@@ -161,7 +166,7 @@ def run(
         coupling=coupling,
         stiffness=stiffness,
         press=press,
-        masses=tuple(mass or (0.5, 1.2)),
+        masses=tuple(mass) if mass else None,
         motion_scale=motion_scale,
         force_scale=force_scale,
         passive=passivity,
@@ -176,7 +181,7 @@ def run(
         "arm": arm,
         "coupling": coupling,
         "passivity layer": "on" if passivity else "off",
-        "motion scale": motion_scale,
+        "motion scale": setup.motion_scale,
         "force scale": setup.follower.force_scale,
         "delay, jitter [s]": f"{delay:g}, {jitter:g}",
         "loss, duplicates": f"{loss:g}, {duplicate:g}",

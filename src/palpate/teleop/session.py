@@ -16,7 +16,7 @@ from ..errors import InputError
 from .channel import Faults, FaultyLine, Sealer
 from .coupling import Event, MasterSide, SlaveSide, felt_force
 from .masters import HapticDevice
-from .slaves import SimulatedSlave
+from .slaves import InScene
 
 Progress: TypeAlias = Callable[[float, float], None]
 """told the simulated time and the whole time [s], now and then"""
@@ -116,7 +116,7 @@ class Run:
 
 def run(
     device: HapticDevice,
-    slave: SimulatedSlave,
+    slave: InScene,
     master_side: MasterSide,
     slave_side: SlaveSide,
     seconds: float,

@@ -10,10 +10,11 @@ from .._core import LinkOptions, TankOptions
 from ..arm import Array
 from .channel import Faults
 from .coupling import CouplingName, MasterSide, SlaveSide
+from .industrial import IndustrialSlave
 from .masters import Hand, HapticDevice
 from .scenes import Scene, find, slave_arm
 from .session import Cut, Progress, Run, run
-from .slaves import SimulatedSlave
+from .slaves import InScene, SimulatedSlave
 
 TANK = {"initial": 0.05, "desired": 0.1, "most": 0.5}
 """of both sides [J]: what a hand gives that presses 5 N over 2 cm; without an initial charge the first touch finds
@@ -24,6 +25,8 @@ THRESHOLD = 5.0
 """of what is felt, in standard deviations [1]: at 1 kHz three are passed every third of a second"""
 ACCELERATION = 10.0
 """of the slave's reference at most [m/s^2]: twice what a hand does, and what the arm's joints can follow"""
+SPEED = 0.8
+"""of the slave's reference at most [m/s]"""
 REACH = 0.3
 """of the workspace to each side of the start [m]"""
 
@@ -45,7 +48,7 @@ class Setup:
 
     scene: Scene | None
     device: HapticDevice
-    slave: SimulatedSlave
+    slave: InScene
     master: MasterSide
     follower: SlaveSide
     motion_scale: float
@@ -87,8 +90,8 @@ def build(
     coupling: CouplingName = "force_position",
     stiffness: float = 2000.0,
     press: float = 0.02,
-    masses: tuple[float, ...] = (0.5, 1.2),
-    motion_scale: float = 1.0,
+    masses: tuple[float, ...] | None = None,
+    motion_scale: float | None = None,
     force_scale: float | None = None,
     hand: Hand | None = None,
     passive: bool = True,
@@ -102,8 +105,8 @@ def build(
         coupling: "force_position", "position_position" or "four_channel".
         stiffness: of the wall [N/m].
         press: how far behind the wall or the surface the hand goes [m].
-        masses: of the objects to lift [kg].
-        motion_scale: motion of the slave per motion of the master [1].
+        masses: of the objects to lift [kg]; None: what suits the arm.
+        motion_scale: motion of the slave per motion of the master [1]; None: what suits device and arm.
         force_scale: force felt per force of the environment [1]; None: what suits device and arm.
         hand: who holds the device; None: the scene's script.
         passive: the passivity layer.
@@ -116,7 +119,9 @@ def build(
     chosen = slave_arm(arm)
     T = chosen.arm.forward_kinematics(chosen.q)
     tip: Array = T[:3, :3] @ chosen.arm.grasp + T[:3, 3]
-    place = None if scene is None else find(scene, tip, stiffness=stiffness, press=press, masses=masses)
+    motion_scale = chosen.motion_scale if motion_scale is None else motion_scale
+    lifted = chosen.masses if masses is None else masses
+    place = None if scene is None else find(scene, tip, stiffness=stiffness, press=press, masses=lifted)
     path = None if place is None else place.path
     if hand is None:
         hand = Hand() if path is None else Hand(wish=lambda t: np.asarray(path(t)) / motion_scale)
@@ -126,7 +131,7 @@ def build(
     return Setup(
         scene=place,
         device=device,
-        slave=SimulatedSlave(chosen.arm, chosen.q, place, seed=seed),
+        slave=(IndustrialSlave if chosen.phase_currents else SimulatedSlave)(chosen.arm, chosen.q, place, seed=seed),
         master=MasterSide(
             3,
             device.force_limit,
@@ -139,10 +144,10 @@ def build(
         ),
         follower=SlaveSide(
             3,
-            0.5,
+            SPEED,
             lower=tip - REACH,
             upper=tip + REACH,
-            force_limit=100.0,
+            force_limit=chosen.force_limit,
             acceleration=ACCELERATION,
             threshold=THRESHOLD,
             coupling=coupling,

@@ -1,0 +1,90 @@
+"""The ABB IRB 2400-16 as a slave: heavy, not backdrivable, under the position control of its own drives; what touches
+it is told from its phase currents alone (E. del Sol, P. Pagala, R. King, M. Ferre, 2014)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..arm import Arm, Array
+from ..drivers.mujoco import MujocoDriver
+from ..logs import Sample
+from ..simulate.drives import GearedPlant, position_gains
+from ..simulate.irb2400 import CurrentSensors, PhaseSensors, truth_drives
+from .motor_force import MotorForce, identified
+from .slaves import InScene, Seen
+
+if TYPE_CHECKING:
+    from .scenes import Scene
+
+SENSORS = 11
+"""seed of the current sensors that were there when the robot was identified"""
+
+
+class IndustrialSlave(InScene):
+    """Follows a reference of its tool's tip by the position control of geared drives, and estimates what touches it.
+
+    Outside sees encoder counts and phase currents. The drives' own control knows the links as their maker does and
+    turns the motors stiffly; what touches the tool moves it by little::
+
+        tau_m = B^-T ID(q_r, q_r', q_r'') + I B q_r'' + k_p e + k_d e' + k_i int e,    e = B (q_r - q)
+
+    Nothing is felt before the motors have turned: at rest friction may hide a push. While a glitch hides a current
+    the last force is held.
+
+    Args:
+        arm: as it is, with its tool.
+        q: (6,) pose at the start [rad].
+        scene: what there is to touch; None: nothing.
+        seed: of the sensors' noise.
+
+    Raises:
+        MissingExtraError: mujoco is not installed.
+    """
+
+    def __init__(self, arm: Arm, q: Array, scene: Scene | None = None, *, seed: int = 0) -> None:
+        drives = truth_drives(arm)
+        build = None if scene is None else scene.build
+        self._drives = drives
+        self._inverse = np.linalg.inv(drives.B)
+        self._gains = position_gains(drives, GearedPlant.seen_inertia(arm, drives, q))
+        self._integral = np.zeros(arm.n)
+        sensors = PhaseSensors(CurrentSensors.drawn(np.random.default_rng(SENSORS)), seed=seed)
+        plant = GearedPlant(arm, drives, q, contacts=build is not None, scene=build)
+        self._estimator = MotorForce(arm, identified(arm.name), period=sensors.period_ns * 1e-9)
+        driver = MujocoDriver(plant, sensor=sensors, q=q)
+        super().__init__(driver, scene, model=arm)
+
+    def hold(self, mass: float) -> None:
+        """From now on this mass in the hand is known [kg]: its weight and inertia are not felt."""
+        self._estimator.hold(mass)
+
+    def _take(self, sample: Sample) -> None:
+        self._felt = self._estimator.step(sample)
+
+    def _see(self) -> Seen:
+        felt = self._felt
+        # where it is the encoders tell at once; what touches it comes later
+        _, tip, J = self._pose(np.asarray(self._sample.position))
+        return Seen(
+            self._sample.time_ns,
+            np.asarray(self._sample.position),
+            felt.dq,
+            tip,
+            J[:3] @ felt.dq,
+            felt.force if felt.good else np.zeros(3),
+            felt.shown if felt.good else np.full(3, np.inf),
+            self._reason,
+            felt.good and self._lost == 0,
+        )
+
+    def _torque(self, ddq_ref: Array) -> Array:
+        B, plant = self._drives.B, self.plant
+        kp, kd, ki = self._gains
+        error = B @ (self._q_ref - plant.q)
+        self._integral = self._integral + self._period * error
+        rigid = self.model.inverse_dynamics(self._q_ref, self._dq_ref, ddq_ref) @ self._inverse
+        motor = rigid + self._drives.inertia * (B @ ddq_ref)
+        motor = motor + kp * error + kd * (B @ (self._dq_ref - plant.dq)) + ki * self._integral
+        return motor @ B
