@@ -18,6 +18,10 @@ from .slaves import InScene, Seen
 if TYPE_CHECKING:
     from .scenes import Scene
 
+TRACKER = 80.0
+"""bandwidth with which the robot's controller smooths the reference it is given [rad/s]"""
+PLAY = 2e-4
+"""so far the hand may move before the reference does, or its tremor would turn the motors back all the time [m]"""
 SENSORS = 11
 """seed of the current sensors that were there when the robot was identified"""
 
@@ -55,6 +59,8 @@ class IndustrialSlave(InScene):
         self._estimator = MotorForce(arm, identified(arm.name), period=sensors.period_ns * 1e-9)
         driver = MujocoDriver(plant, sensor=sensors, q=q)
         super().__init__(driver, scene, model=arm)
+        self._goal = self.x.copy()
+        self._x, self._v, self._a = self.x.copy(), np.zeros(3), np.zeros(3)
 
     def hold(self, mass: float) -> None:
         """From now on this mass in the hand is known [kg]: its weight and inertia are not felt."""
@@ -78,6 +84,23 @@ class IndustrialSlave(InScene):
             self._reason,
             felt.good and self._lost == 0,
         )
+
+    def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:
+        """As of :class:`ArmSlave`, the reference smoothed: da/dt = w^3 (x_r - x) + 3 w^2 (v_r - v) - 3 w a.
+
+        A hand's encoder steps would make the currents jump, and then no glitch could be told from them.
+        """
+        w, h = TRACKER, self._period
+        away = x_ref - self._goal
+        far = float(np.linalg.norm(away))
+        if far > PLAY:
+            self._goal = self._goal + (1.0 - PLAY / far) * away
+        v = v_ref if far > PLAY else np.zeros(3)
+        jerk = w**3 * (self._goal - self._x) + 3.0 * w**2 * (v - self._v) - 3.0 * w * self._a
+        self._a = self._a + h * jerk
+        self._v = self._v + h * self._a
+        self._x = self._x + h * self._v
+        return super().follow(self._x, self._v, push)
 
     def _torque(self, ddq_ref: Array) -> Array:
         B, plant = self._drives.B, self.plant

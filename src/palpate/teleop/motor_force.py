@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -17,12 +18,18 @@ from ..arm import Arm, Array
 from ..errors import InputError
 from ..identify import Fit
 from ..logs import Sample
+from ..logs.repair import BoolArray
 from ..phase import PhaseCurrents
 
 KINEMATIC, CUTOFF = 200.0, 100.0
 """low-passes of position and current before friction and acceleration are computed; of the residual [rad/s]"""
 PUSH_RATE = 300.0
 """how fast an external torque may change unseen while a glitch hides a current [N m/s]"""
+TURNED_BACK, TURNED_BY = 0.045, 4.5e-5
+"""a motor that turns back has no sine for so long [s]; it has turned back when it is so far from where it was farthest
+[rad]"""
+BEFORE = 0.012
+"""so long a glitch spoils currents before anything shows it [s]"""
 CATCH_UP = 2.0 / KINEMATIC
 """how long the currents' low-pass needs after a glitch [s]"""
 DIRECT_SHARE, CURRENT_RATE = 0.05, 20.0
@@ -168,6 +175,12 @@ class LowPass:
         self._a1, self._a2 = 2.0 * (k * k - 1.0) * norm, (1.0 - math.sqrt(2.0) * k + k * k) * norm
         self._s: tuple[Array, Array] | None = None
 
+    def settle(self, x: Array, which: BoolArray) -> None:
+        """As if the components `which` had been x for long."""
+        if self._s is not None:
+            rest = (1.0 - self._b) * x, (self._b - self._a2) * x
+            self._s = np.where(which, rest[0], self._s[0]), np.where(which, rest[1], self._s[1])
+
     def __call__(self, x: Array) -> Array:
         """The next value, the shape of x."""
         if self._s is None:
@@ -242,6 +255,8 @@ class MotorForce:
         self._z, self._bump = np.zeros(n), np.zeros(n)
         self._residual = np.zeros(n)
         self._since, self._hidden = np.full(n, math.inf), np.zeros(n)
+        self._way, self._turned, self._farthest = np.zeros(n), np.full(n, math.inf), np.full(n, math.nan)
+        self._past = deque([np.zeros(n)], maxlen=max(1, round(BEFORE / self._h)))
 
     def hold(self, mass: float) -> None:
         """From now on this mass at the grasp point is known [kg]: its weight and inertia are not felt."""
@@ -275,12 +290,16 @@ class MotorForce:
             np.where(np.isfinite(found.current[0]), found.current[0], 0.0) * m.gain
         )
 
-        blind = status != Status.ok
+        blind = (status != Status.ok) | self._turns_back(m.B @ position)
         self._since = np.where(blind, 0.0, self._since + h)
         after = self._since <= CATCH_UP + 0.5 * h
+        begins = after & (self._hidden == 0.0)
         self._hidden = np.where(after, self._hidden + h, 0.0)
-        self._residual = np.where(after, self._residual, residual)
+        if begins.any():
+            self._smooth.settle(self._past[0], begins)
+        self._residual = np.where(begins, self._past[0], np.where(after, self._residual, residual))
         external = self._smooth(self._residual)
+        self._past.append(external)
 
         tau = external @ m.B - self._of_load(q, dq)
         variance = m.sliding_std**2 + m.turning_std**2 * (1.0 - self._z**2) + (m.gain_std * external) ** 2
@@ -289,6 +308,20 @@ class MotorForce:
         if self._hidden.any():
             _, std = self._force(q, tau, variance + (PUSH_RATE * self._hidden) ** 2)
         return MotorTouch(q, dq, tau, force, std, shown, self._z, bool(self._hidden.any()), good)
+
+    def _turns_back(self, position: Array) -> BoolArray:
+        """(n,) motors that have turned back lately, by their positions (n,) [rad]."""
+        ahead = (position - self._farthest) * self._way
+        first = np.isnan(self._farthest)
+        back = (self._way != 0.0) & (ahead < -TURNED_BY)
+        starts = (self._way == 0.0) & (np.abs(position - self._farthest) > TURNED_BY)
+        self._turned = np.where(back, 0.0, self._turned + self._h)
+        self._way = np.where(
+            back, -self._way, np.where(starts, np.sign(position - self._farthest), self._way)
+        )
+        self._farthest = np.where(first | back | starts | (ahead > 0.0), position, self._farthest)
+        found: BoolArray = self._turned < TURNED_BACK
+        return found
 
     def _needed(self, q: Array, dq: Array, ddq: Array) -> Array:
         """(n,) torque of the motors for this motion [N m]; friction remembers it."""

@@ -281,6 +281,7 @@ class SlaveArm:
         arm: with the tool as a shape, its grasp point at the centre of the tool's tip.
         q: (n,) pose at the start [rad].
         force_scale: force felt per force of the environment, so that the device's range fits the arm's [1].
+        gain: with which the reference closes on the master's place [1/s].
         motion_scale: motion of the arm per motion of the hand [1].
         force_limit: largest force that is told [N].
         masses: of objects that suit it [kg].
@@ -292,6 +293,7 @@ class SlaveArm:
     q: Array
     force_scale: float
     assumed: tuple[str, ...]
+    gain: float = 60.0
     motion_scale: float = 1.0
     force_limit: float = 100.0
     masses: tuple[float, ...] = (0.5, 1.2)
@@ -331,6 +333,7 @@ def slave_arm(name: str) -> SlaveArm:
                 "torque constants, gears, rotors, presliding, ripple and the errors of the current sensors of the ABB: "
                 "no source states them; they are those of the sensorless-force study",
             ),
+            gain=20.0,
             motion_scale=2.0,
             force_limit=200.0,
             masses=(6.0, 14.0),

@@ -131,7 +131,9 @@ def build(
     return Setup(
         scene=place,
         device=device,
-        slave=(IndustrialSlave if chosen.phase_currents else SimulatedSlave)(chosen.arm, chosen.q, place, seed=seed),
+        slave=(IndustrialSlave if chosen.phase_currents else SimulatedSlave)(
+            chosen.arm, chosen.q, place, seed=seed
+        ),
         master=MasterSide(
             3,
             device.force_limit,
@@ -151,6 +153,7 @@ def build(
             acceleration=ACCELERATION,
             threshold=THRESHOLD,
             coupling=coupling,
+            gain=chosen.gain,
             motion_scale=motion_scale,
             force_scale=scale,
             tank=tank,

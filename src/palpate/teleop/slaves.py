@@ -100,6 +100,7 @@ class ArmSlave:
         assert sample is not None
         self._sample = sample
         self.hold(held)
+        self._take(sample)
         self._q_ref = np.array(sample.position)
         self._home = self._q_ref.copy()
         self._dq_ref = np.zeros(arm.n)
@@ -118,7 +119,6 @@ class ArmSlave:
             wrench=WrenchEstimator(moment_prior_std=3.0),
             load=HeldLoad(mass=mass),
         )
-        self._take(self._sample)
 
     def _take(self, sample: Sample) -> None:
         """Estimate what touches."""
