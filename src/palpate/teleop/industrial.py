@@ -20,8 +20,10 @@ if TYPE_CHECKING:
 
 TRACKER = 80.0
 """bandwidth with which the robot's controller smooths the reference it is given [rad/s]"""
-PLAY = 2e-4
+PLAY = 3e-4
 """so far the hand may move before the reference does, or its tremor would turn the motors back all the time [m]"""
+CERTAIN = 6.0
+"""a force of so many standard deviations is a touch, until it is less than half as many of sliding friction [1]"""
 SENSORS = 11
 """seed of the current sensors that were there when the robot was identified"""
 
@@ -34,8 +36,8 @@ class IndustrialSlave(InScene):
 
         tau_m = B^-T ID(q_r, q_r', q_r'') + I B q_r'' + k_p e + k_d e' + k_i int e,    e = B (q_r - q)
 
-    Nothing is felt before the motors have turned: at rest friction may hide a push. While a glitch hides a current
-    the last force is held.
+    Where friction turns over it is known less well, and at rest it may hide a push: little is felt then, unless a
+    touch was certain before. While a glitch hides a current the last force is held.
 
     Args:
         arm: as it is, with its tool.
@@ -56,6 +58,7 @@ class IndustrialSlave(InScene):
         self._integral = np.zeros(arm.n)
         sensors = PhaseSensors(CurrentSensors.drawn(np.random.default_rng(SENSORS)), seed=seed)
         plant = GearedPlant(arm, drives, q, contacts=build is not None, scene=build)
+        self._certain = False
         self._estimator = MotorForce(arm, identified(arm.name), period=sensors.period_ns * 1e-9)
         driver = MujocoDriver(plant, sensor=sensors, q=q)
         super().__init__(driver, scene, model=arm)
@@ -67,7 +70,12 @@ class IndustrialSlave(InScene):
         self._estimator.hold(mass)
 
     def _take(self, sample: Sample) -> None:
-        self._felt = self._estimator.step(sample)
+        felt = self._felt = self._estimator.step(sample)
+        size = np.abs(felt.force)
+        self._certain = bool(
+            np.any(size > CERTAIN * felt.seen_std)
+            or (self._certain and np.any(size > 0.5 * CERTAIN * felt.sliding_std))
+        )
 
     def _see(self) -> Seen:
         felt = self._felt
@@ -80,9 +88,10 @@ class IndustrialSlave(InScene):
             tip,
             J[:3] @ felt.dq,
             felt.force if felt.good else np.zeros(3),
-            felt.shown if felt.good else np.full(3, np.inf),
+            felt.std if felt.good else np.full(3, np.inf),
             self._reason,
             felt.good and self._lost == 0,
+            (felt.sliding_std if self._certain else felt.seen_std) if felt.good else np.full(3, np.inf),
         )
 
     def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:

@@ -204,8 +204,10 @@ class MotorTouch(NamedTuple):
     """(3,) on the tool, base axes [N]"""
     std: Array
     """(3,) its standard deviation [N]"""
-    shown: Array
-    """(3,) the same without what a glitch might hide: to tell a held force from one that is not there [N]"""
+    seen_std: Array
+    """(3,) the same without what a glitch might hide [N]"""
+    sliding_std: Array
+    """(3,) the same if friction slid [N]"""
     z: Array
     """(n,) remembered sign of the motors' friction [1]"""
     hidden: bool
@@ -302,12 +304,15 @@ class MotorForce:
         self._past.append(external)
 
         tau = external @ m.B - self._of_load(q, dq)
-        variance = m.sliding_std**2 + m.turning_std**2 * (1.0 - self._z**2) + (m.gain_std * external) ** 2
-        force, shown = self._force(q, tau, variance)
-        std = shown
-        if self._hidden.any():
-            _, std = self._force(q, tau, variance + (PUSH_RATE * self._hidden) ** 2)
-        return MotorTouch(q, dq, tau, force, std, shown, self._z, bool(self._hidden.any()), good)
+        sliding = m.sliding_std**2 + (m.gain_std * external) ** 2
+        seen = sliding + m.turning_std**2 * (1.0 - self._z**2)
+        covariance = np.einsum(
+            "ki,rk,kj->rij", m.B, [seen + (PUSH_RATE * self._hidden) ** 2, seen, sliding], m.B
+        )
+        three = np.ones((3, 1))
+        solved = solve_wrench(self.arm.core, self._wrench, three * q, three * tau, covariance)
+        force, std = solved["force"][1], solved["force_std"]
+        return MotorTouch(q, dq, tau, force, std[0], std[1], std[2], self._z, bool(self._hidden.any()), good)
 
     def _turns_back(self, position: Array) -> BoolArray:
         """(n,) motors that have turned back lately, by their positions (n,) [rad]."""
@@ -349,8 +354,3 @@ class MotorForce:
         a = (v - self._v) / self._h
         self._v = v
         return self._mass * (J.T @ (self.arm.gravity - a))
-
-    def _force(self, q: Array, tau: Array, variance: Array) -> tuple[Array, Array]:
-        covariance = self.model.B.T @ (variance[:, None] * self.model.B)
-        solved = solve_wrench(self.arm.core, self._wrench, q[None], tau[None], covariance[None])
-        return solved["force"][0], solved["force_std"][0]

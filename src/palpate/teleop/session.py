@@ -16,8 +16,11 @@ from ..errors import InputError
 from .channel import Faults, FaultyLine, Sealer
 from .coupling import Event, MasterSide, SlaveSide, felt_force
 from .masters import HapticDevice
+from .servo_arms import LeaderArm
 from .slaves import InScene
 
+Master: TypeAlias = HapticDevice | LeaderArm
+"""what a hand holds"""
 Progress: TypeAlias = Callable[[float, float], None]
 """told the simulated time and the whole time [s], now and then"""
 
@@ -38,6 +41,8 @@ class Cut:
 @dataclass(slots=True, eq=False)
 class Run:
     """What happened, one row per period; (N, 3) in base axes of the slave, but the device's own columns.
+
+    Joint to joint they are (N, n), with [rad] and [N m] in place of [m] and [N].
 
     Attributes:
         time: (N,) [s].
@@ -87,25 +92,25 @@ class Run:
     held: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     @classmethod
-    def empty(cls, count: int, n: int) -> Run:
-        """Room for `count` periods of a slave with `n` joints."""
+    def empty(cls, count: int, n: int, axes: int = 3) -> Run:
+        """Room for `count` periods of a slave with `n` joints of which `axes` are coupled."""
 
-        def three() -> Array:
-            return np.zeros((count, 3))
+        def each() -> Array:
+            return np.zeros((count, axes))
 
         return cls(
             time=np.arange(count, dtype=np.float64) * PERIOD,
-            device=three(),
-            device_velocity=three(),
-            wanted=three(),
-            tip=three(),
-            tip_velocity=three(),
-            reference=three(),
-            force=three(),
-            felt=three(),
-            estimated=three(),
-            std=three(),
-            true=three(),
+            device=each(),
+            device_velocity=each(),
+            wanted=each(),
+            tip=each(),
+            tip_velocity=each(),
+            reference=each(),
+            force=each(),
+            felt=each(),
+            estimated=each(),
+            std=each(),
+            true=each(),
             master_events=np.zeros(count, dtype=np.int64),
             slave_events=np.zeros(count, dtype=np.int64),
             levels=np.zeros((count, 2)),
@@ -115,7 +120,7 @@ class Run:
 
 
 def run(
-    device: HapticDevice,
+    device: Master,
     slave: InScene,
     master_side: MasterSide,
     slave_side: SlaveSide,
@@ -154,12 +159,12 @@ def run(
     if not 0.0 < seconds <= 3600.0:
         raise InputError(f"seconds must be above 0 to 3600, got {seconds!r}")
     count = round(seconds / PERIOD)
-    out = Run.empty(count, slave.model.n)
+    out = Run.empty(count, slave.model.n, slave.axes)
     rng = np.random.default_rng(seed)
     key = rng.bytes(32)
     boxes = {
-        "master": Sealer(key, "master", 1, 3, salt=rng.bytes(8)),
-        "slave": Sealer(key, "slave", 1, 3, salt=rng.bytes(8)),
+        "master": Sealer(key, "master", 1, slave.axes, salt=rng.bytes(8)),
+        "slave": Sealer(key, "slave", 1, slave.axes, salt=rng.bytes(8)),
     }
     there, back = (FaultyLine(faults or Faults(), seed + k) for k in range(2))
     sent = [0, 0]
@@ -188,9 +193,10 @@ def run(
             if (told := boxes["slave"].open(packet, now)) is not None:
                 slave_side.receive(told)
         # noise is no work: the reference pays for what is felt
-        port = felt_force(seen.force, seen.std, slave_side.threshold)
+        std = seen.std if seen.felt_std is None else seen.felt_std
+        port = felt_force(seen.force, std, slave_side.threshold)
         reference = slave_side.step(
-            seen.x, seen.v, seen.force, seen.std, PERIOD, now, port=port, allowed=seen.usable
+            seen.x, seen.v, seen.force, std, PERIOD, now, port=port, allowed=seen.usable
         )
         slave.follow(reference.position, reference.velocity, reference.force)
         packet = boxes["slave"].seal(slave_side.message(), now)

@@ -12,8 +12,9 @@ from .channel import Faults
 from .coupling import CouplingName, MasterSide, SlaveSide
 from .industrial import IndustrialSlave
 from .masters import Hand, HapticDevice
-from .scenes import Scene, find, slave_arm
-from .session import Cut, Progress, Run, run
+from .scenes import Scene, SlaveArm, find, slave_arm
+from .servo_arms import ServoSlave, SimulatedLeader, joint_path
+from .session import Cut, Master, Progress, Run, run
 from .slaves import InScene, SimulatedSlave
 
 TANK = {"initial": 0.05, "desired": 0.1, "most": 0.5}
@@ -21,10 +22,10 @@ TANK = {"initial": 0.05, "desired": 0.1, "most": 0.5}
 nothing to pay with"""
 CONTACT_DAMPING = 30.0
 """of the device in contact [N s/m]: it makes up for the estimate's 6 ms and the line's 1 ms"""
-THRESHOLD = 5.0
-"""of what is felt, in standard deviations [1]: at 1 kHz three are passed every third of a second"""
 ACCELERATION = 10.0
 """of the slave's reference at most [m/s^2]: twice what a hand does, and what the arm's joints can follow"""
+JOINT_HAND = {"mass": 0.03, "stiffness": 25.0, "damping": 1.2, "tremor": 0.01}
+"""a :class:`Hand` of 0.5 kg, 400 N/m at a lever of a quarter metre [kg m^2, N m/rad, N m s/rad, N m]"""
 SPEED = 0.8
 """of the slave's reference at most [m/s]"""
 REACH = 0.3
@@ -47,7 +48,7 @@ class Setup:
     """
 
     scene: Scene | None
-    device: HapticDevice
+    device: Master
     slave: InScene
     master: MasterSide
     follower: SlaveSide
@@ -123,6 +124,8 @@ def build(
     lifted = chosen.masses if masses is None else masses
     place = None if scene is None else find(scene, tip, stiffness=stiffness, press=press, masses=lifted)
     path = None if place is None else place.path
+    if chosen.kind == "servos":
+        return _joint_to_joint(chosen, place, coupling, hand, passive, seed)
     if hand is None:
         hand = Hand() if path is None else Hand(wish=lambda t: np.asarray(path(t)) / motion_scale)
     device = HapticDevice(hand)
@@ -131,7 +134,7 @@ def build(
     return Setup(
         scene=place,
         device=device,
-        slave=(IndustrialSlave if chosen.phase_currents else SimulatedSlave)(
+        slave=(IndustrialSlave if chosen.kind == "phase_currents" else SimulatedSlave)(
             chosen.arm, chosen.q, place, seed=seed
         ),
         master=MasterSide(
@@ -151,7 +154,7 @@ def build(
             upper=tip + REACH,
             force_limit=chosen.force_limit,
             acceleration=ACCELERATION,
-            threshold=THRESHOLD,
+            threshold=chosen.threshold,
             coupling=coupling,
             gain=chosen.gain,
             motion_scale=motion_scale,
@@ -162,6 +165,69 @@ def build(
             session=1,
         ),
         motion_scale=motion_scale,
+        seconds=10.0 if place is None else place.seconds,
+        assumed=chosen.assumed,
+    )
+
+
+def _joint_to_joint(
+    chosen: SlaveArm,
+    place: Scene | None,
+    coupling: CouplingName,
+    hand: Hand | None,
+    passive: bool,
+    seed: int,
+) -> Setup:
+    """A leader arm in a hand and its twin in a scene; `hand` is at the joints."""
+    arm, q = chosen.arm, chosen.q
+    if hand is None:
+        wish = (lambda time: q) if place is None else joint_path(arm, q, place.path, place.seconds)
+        hand = Hand(wish=wish, **JOINT_HAND)
+    leader = SimulatedLeader(arm, q, hand, seed=seed + 1)
+    tank, link = TankOptions(**TANK), LinkOptions()
+    limits = [j.limits for j in arm.joints]
+    return Setup(
+        scene=place,
+        device=leader,
+        slave=ServoSlave(arm, q, place, seed=seed),
+        master=MasterSide(
+            arm.n,
+            leader.force_limit,
+            coupling=coupling,
+            stiffness=6.0,
+            damping=0.1,
+            fill=0.02,
+            contact_damping=0.3,
+            hold_stiffness=5.0,
+            hold_damping=0.1,
+            acceleration=200.0,
+            resync_rate=10.0,
+            tank=tank,
+            link=link,
+            passive=passive,
+            session=1,
+        ),
+        follower=SlaveSide(
+            arm.n,
+            [limit.velocity for limit in limits],
+            lower=[limit.lower for limit in limits],
+            upper=[limit.upper for limit in limits],
+            force_limit=[limit.effort for limit in limits],
+            acceleration=60.0,
+            threshold=chosen.threshold,
+            coupling=coupling,
+            task_space=False,
+            gain=chosen.gain,
+            resync="approach",
+            resync_speed=0.2,
+            resync_acceleration=1.0,
+            wall=5.0,
+            tank=tank,
+            link=link,
+            passive=passive,
+            session=1,
+        ),
+        motion_scale=1.0,
         seconds=10.0 if place is None else place.seconds,
         assumed=chosen.assumed,
     )

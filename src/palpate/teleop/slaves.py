@@ -48,6 +48,7 @@ class Seen:
         force, std: (3,) of the environment on the tool as estimated, base axes [N].
         reason: why it holds or slows down, empty: it does not.
         usable: it may be moved.
+        felt_std: (3,) deviation that decides what a hand is shown [N]; None: `std`.
     """
 
     time_ns: int
@@ -59,6 +60,7 @@ class Seen:
     std: Array
     reason: str
     usable: bool
+    felt_std: Array | None = None
 
 
 class ArmSlave:
@@ -261,6 +263,11 @@ class InScene(ArmSlave):
         super().__init__(driver, model=model)
         self._masses = list(() if scene is None else scene.masses)
         self._contact = np.zeros(6)
+
+    @property
+    def axes(self) -> int:
+        """What is coupled: three of space, or the joints."""
+        return 3
 
     @property
     def plant(self) -> Plant:
