@@ -337,10 +337,10 @@ def slave_arm(name: str) -> SlaveArm:
             1.0,
             (
                 "load friction of the SO-101's gears as measured on the 7.4 V servo; its current is good to a step of "
-                "6.5 mA; leader and follower are read at 1 kHz, where a bus allows 250 Hz",
+                "6.5 mA",
             ),
-            gain=15.0,
-            threshold=3.0,
+            gain=40.0,
+            threshold=4.0,
             masses=(0.1, 0.2),
             kind="servos",
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,13 +35,17 @@ CURRENT_STEP = 6.5e-3
 """of the current that it reports [A]"""
 LOAD_FRICTION = 0.2116
 """part of the load its gears lose (Rhoban/bam, feetech_sts3215_7_4V, m3) [1]"""
-BANDWIDTH = 25.0
+BANDWIDTH = 35.0
 """of the follower's position control [rad/s]: encoders of 12 bit allow no more"""
-OBSERVER = 60.0
+STIFFENING = 6.0
+"""bandwidth with which the external torque is taken off [rad/s]"""
+BUS_RATE = 250.0
+"""readings and commands per second, what a bus of six servos at 1 Mbit/s allows [Hz]"""
+OBSERVER = 30.0
 """bandwidth of the follower's momentum observer [rad/s]"""
 TURNING = 0.05
 """speed from which on the sign of friction is known: the encoder has turned a few counts lately [rad/s]"""
-VELOCITY = 60.0
+VELOCITY = 120.0
 """low-pass of positions before velocities are taken [rad/s]"""
 
 
@@ -57,7 +62,7 @@ def with_servos(arm: Arm) -> Arm:
 def with_load_friction(arm: Arm) -> Arm:
     """The arm as it is: its gears lose a part of what they carry."""
     return arm.replace(
-        joints=tuple(j.replace(friction=j.friction.replace(load=LOAD_FRICTION)) for j in arm.joints)
+        joints=tuple(j.replace(friction=replace(j.friction, load=LOAD_FRICTION)) for j in arm.joints)
     )
 
 
@@ -73,7 +78,7 @@ class LeaderArm:
         force_limit: (n,) torque that is added at most, or one number [N m].
     """
 
-    def __init__(self, driver: Driver, arm: Arm, *, force_limit: float | Array = 1.0) -> None:
+    def __init__(self, driver: Driver, arm: Arm, *, force_limit: float | Array = 2.0) -> None:
         self.driver, self.arm = driver, arm
         self.force_limit: Array = np.broadcast_to(np.asarray(force_limit, dtype=np.float64), (arm.n,))
         self._period = driver.period_ns * 1e-9
@@ -82,6 +87,7 @@ class LeaderArm:
         driver.enable()
         self._dq = np.zeros(arm.n)
         self._smooth: Array | None = None
+        self._due = 0.0
         self._take(driver.read())
 
     def _take(self, sample: Sample | None) -> None:
@@ -100,11 +106,16 @@ class LeaderArm:
         return self._q, self._dq
 
     def step(self, force: Array, dt: float) -> None:
-        """Push back with a torque (n,) [N m] for a period; waits for the next sample.
+        """Push back with a torque (n,) [N m] for `dt` [s]; the bus is slower than the coupling, so it is told now and
+        then, and the next sample is waited for.
 
         Raises:
             DriverError: the arm does not answer.
         """
+        self._due += dt
+        if self._due < self._period - 1e-9:
+            return
+        self._due = 0.0
         felt = np.clip(force, -self.force_limit, self.force_limit)
         self.driver.write(self.arm.gravity_torque(self._q) + felt)
         self._take(self.driver.read())
@@ -146,7 +157,7 @@ class SimulatedLeader(LeaderArm):
         known = with_servos(arm)
         rotors = tuple(j.replace(rotor_inertia=j.rotor_inertia + hand.mass) for j in known.joints)
         plant = HeldPlant(known.replace(joints=rotors), hand)
-        sensor = SensorModel(known, rate=RATE, seed=seed)
+        sensor = SensorModel(known, rate=BUS_RATE, seed=seed)
         super().__init__(MujocoDriver(plant, sensor=sensor, q=q), known)
 
 
@@ -178,8 +189,8 @@ class ServoSlave(InScene):
             integrator="discrete",
         )
         self._coulomb = np.array([j.friction.coulomb for j in known.joints])
-        self._friction = np.zeros(arm.n)
-        driver = MujocoDriver(plant, sensor=SensorModel(known, rate=RATE, seed=seed), q=q)
+        driver = MujocoDriver(plant, sensor=SensorModel(known, rate=BUS_RATE, seed=seed), q=q)
+        self._every, self._tick = round(RATE / BUS_RATE), 0
         super().__init__(driver, scene, model=known)
 
     @property
@@ -196,6 +207,11 @@ class ServoSlave(InScene):
             wrench=None,
             load=HeldLoad(mass=mass),
         )
+
+    def read(self) -> Seen:
+        """What is known; the bus tells something new every few periods."""
+        self._tick += 1
+        return super().read() if self._tick % self._every == 1 else self.seen
 
     def _see(self) -> Seen:
         touch, q = self._touch, np.asarray(self._sample.position)
@@ -225,8 +241,10 @@ class ServoSlave(InScene):
         """Send the torque that takes the joints to `x_ref` (n,) [rad] at `v_ref` (n,) [rad/s].
 
         Returns:
-            (n,) torque sent [N m]; zeros if the drives are off.
+            (n,) torque sent [N m]; zeros if nothing is: the bus is busy, or the drives are off.
         """
+        if self._tick % self._every != 1:
+            return np.zeros(self.axes)
         h, seen = self._period, self.seen
         ddq_ref = np.clip((v_ref - self._dq_ref) / h, -40.0, 40.0)
         self._q_ref, self._dq_ref = np.clip(x_ref, self._low, self._high), v_ref
@@ -238,6 +256,8 @@ class ServoSlave(InScene):
         a = ddq_ref + BANDWIDTH**2 * (self._q_ref - seen.q) + 2.0 * BANDWIDTH * (v_ref - seen.dq)
         torque = self.model.inverse_dynamics(seen.q, v_ref, a)
         torque = torque + (self._coulomb + LOAD_FRICTION * np.abs(torque)) * np.tanh(v_ref / TURNING)
+        self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (seen.force - self._taken_off)
+        torque = torque - self._taken_off
         if push is not None:
             torque = torque + push
         if self.driver.state != "enabled":
