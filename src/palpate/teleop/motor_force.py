@@ -287,7 +287,7 @@ class MotorForce:
         dq = (q - before) / h
         ddq = (dq - self._dq) / h
         self._q, self._dq = q, dq
-        needed = self._needed(q, dq, ddq)
+        needed = self._needed(q, dq, ddq) - self._of_load(q, dq) @ self._inverse
         residual = needed - self._current(
             np.where(np.isfinite(found.current[0]), found.current[0], 0.0) * m.gain
         )
@@ -303,7 +303,7 @@ class MotorForce:
         external = self._smooth(self._residual)
         self._past.append(external)
 
-        tau = external @ m.B - self._of_load(q, dq)
+        tau = external @ m.B
         sliding = m.sliding_std**2 + (m.gain_std * external) ** 2
         seen = sliding + m.turning_std**2 * (1.0 - self._z**2)
         covariance = np.einsum(

@@ -119,6 +119,14 @@ class Run:
         )
 
 
+def _weighs(since: float, force: Array, std: Array) -> bool:
+    """An object lifted `since` [s] can be weighed: settled, and known to a twentieth; or it is high time.
+
+    Where friction hides the weight at rest, that is once the arm moves.
+    """
+    return since >= 0.5 and (since >= 2.5 or bool(np.all(std <= 0.05 * abs(float(force.mean())))))
+
+
 def run(
     device: Master,
     slave: InScene,
@@ -202,9 +210,9 @@ def run(
         packet = boxes["slave"].seal(slave_side.message(), now)
         sent[1] += len(packet) + 28
         back.send(packet, now)
-        if weigh and picked and time >= picked_at + 0.5:
-            # at rest what is felt is the weight; from then on it is known, and the hand is spared it
-            lately = out.estimated[k - 200 : k, 2]
+        lately, sure = out.estimated[k - 200 : k, 2], out.std[k - 200 : k, 2]
+        if weigh and picked and _weighs(time - picked_at, lately, sure):
+            # what is felt is the weight; from then on it is known, and the hand is spared it
             found, std = float(-lately.mean() / 9.81), float(out.std[k - 1, 2] / 9.81)
             out.held.append((time, picked, found, std))
             slave.hold(max(0.0, found))
