@@ -213,7 +213,9 @@ def run(
         lately, sure = out.estimated[k - 200 : k, 2], out.std[k - 200 : k, 2]
         if weigh and picked and _weighs(time - picked_at, lately, sure):
             # what is felt is the weight; from then on it is known, and the hand is spared it
-            found, std = float(-lately.mean() / 9.81), float(out.std[k - 1, 2] / 9.81)
+            rise = out.tip_velocity[k - 200 : k, 2]
+            pull = 9.81 + float(rise[-1] - rise[0]) / (len(rise) * PERIOD)
+            found, std = float(-lately.mean() / pull), float(out.std[k - 1, 2] / pull)
             out.held.append((time, picked, found, std))
             slave.hold(max(0.0, found))
             picked = None
