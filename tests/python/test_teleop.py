@@ -95,7 +95,7 @@ def test_a_restarted_side_gives_no_energy_twice_and_old_messages_are_left() -> N
     for k in range(100):
         exchange(master, slave, 0.0, 0.0, 0.0, 0.0, k)
     late = master.message()
-    rich = Message(2, 1, 0, np.zeros(1), np.zeros(1), np.zeros(1), 5.0, 1.0, True)
+    rich = Message(2, 1, 0, np.zeros(1), np.zeros(1), np.zeros(1), 5.0, 0.0, 1.0, True)
     assert slave.receive(rich)
     slave.step(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1), H, 0)
     assert slave.tank()["level"] <= _core.TankOptions().initial + 1e-9

@@ -3,7 +3,7 @@
 A packet is a header in the clear and a body sealed with ChaCha20-Poly1305 (RFC 8439), whose tag covers both::
 
     "PT"  version u8  role u8 | salt 8 bytes | session u64 | sequence u64 | sealed body | tag 16 bytes
-    body: echo 8 bytes | time i64 | echo_time i64 | echo_age i64 | n u8 | flags u8 | energy f64 | level f64 | 3 n f64
+    body: echo 8 bytes | time i64 | echo_time i64 | echo_age i64 | n u8 | flags u8 | energy, booked, level f64 | 3 n f64
 
 The key of a direction in a run is HKDF-SHA256(shared key, salt, role), so a sequence number, which is the nonce,
 never meets a key
@@ -34,7 +34,7 @@ import numpy as np
 from ..arm import Array
 from ..errors import InputError, MissingExtraError, PalpateError
 
-VERSION = 1
+VERSION = 2
 """of the packets; a side with another one is refused"""
 MAX_CLOCK_OFFSET = 30.0
 """clocks further apart than this are refused [s]: the recording of both sides would make no sense"""
@@ -44,7 +44,7 @@ WINDOW = 1024
 Role: TypeAlias = Literal["master", "slave"]
 
 _HEADER = struct.Struct(">2sBB8sQQ")
-_BODY = struct.Struct(">8sqqqBBdd")
+_BODY = struct.Struct(">8sqqqBBddd")
 _TAG = 16
 _NOBODY = bytes(8)
 _SILENCE_NS = 1_000_000_000
@@ -75,6 +75,8 @@ class Message:
     """(n,) [N] or [N m]"""
     energy: float
     """sent since the session began [J]"""
+    booked: float
+    """of what the other side has sent: the rest is still on its way [J]"""
     level: float
     """of the sender's tank [J]"""
     engaged: bool
@@ -225,6 +227,7 @@ class Sealer:
             self.n,
             int(message.engaged),
             message.energy,
+            message.booked,
             message.level,
         )
         header = _HEADER.pack(b"PT", VERSION, _number(self.role), self.salt, self.session, message.sequence)
@@ -255,7 +258,7 @@ class Sealer:
             )
         if len(body) < _BODY.size:
             return self._refused("length", f"a body of {len(body)} bytes")
-        echo, sent_ns, echo_time, echo_age, n, flags, energy, level = _BODY.unpack(body[: _BODY.size])
+        echo, sent_ns, echo_time, echo_age, n, flags, *energies = _BODY.unpack(body[: _BODY.size])
         if n != self.n or len(body) != _BODY.size + 24 * n:
             return self._refused("axes", f"the other side has {n} axes, this one {self.n}")
         if echo != self.salt:
@@ -282,7 +285,7 @@ class Sealer:
                 f"{MAX_CLOCK_OFFSET:g} s are allowed",
             )
         values = np.frombuffer(body, dtype=">f8", offset=_BODY.size).astype(np.float64)
-        if not (np.isfinite(values).all() and math.isfinite(energy) and math.isfinite(level)):
+        if not (np.isfinite(values).all() and all(map(math.isfinite, energies))):
             return self._refused("not finite", "a number is not finite")
         return Message(
             session,
@@ -291,9 +294,8 @@ class Sealer:
             values[:n],
             values[n : 2 * n],
             values[2 * n :],
-            energy,
-            level,
-            bool(flags & 1),
+            *energies,
+            engaged=bool(flags & 1),
         )
 
     def _cipher(self, salt: bytes) -> Any:
