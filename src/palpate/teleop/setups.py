@@ -13,7 +13,7 @@ from .coupling import CouplingName, MasterSide, SlaveSide
 from .masters import Hand, HapticDevice
 from .scenes import Scene, find, slave_arm
 from .session import Cut, Progress, Run, run
-from .slaves import SimulatedSlave
+from .slaves import STIFFEST, SimulatedSlave
 
 TANK = {"initial": 0.05, "desired": 0.1, "most": 0.5}
 """of both sides [J]: what a hand gives that presses 5 N over 2 cm; without an initial charge the first touch finds
@@ -92,12 +92,13 @@ def build(
     force_scale: float | None = None,
     hand: Hand | None = None,
     passive: bool = True,
+    stiffest: float = STIFFEST,
     seed: int = 0,
 ) -> Setup:
     """A haptic device and an arm in a scene.
 
     Args:
-        scene: wall, surface, peg, lift, or None for free motion.
+        scene: wall, rigid, surface, peg, lift, or None for free motion.
         arm: the slave, see :func:`palpate.teleop.scenes.slave_arm`.
         coupling: "force_position", "position_position" or "four_channel".
         stiffness: of the wall [N/m].
@@ -107,6 +108,7 @@ def build(
         force_scale: force felt per force of the environment [1]; None: what suits device and arm.
         hand: who holds the device; None: the scene's script.
         passive: the passivity layer.
+        stiffest: beyond this stiffness of what it touches the slave gives way [N/m]; infinite: it never does.
         seed: of the sensors' noise.
 
     Raises:
@@ -126,7 +128,7 @@ def build(
     return Setup(
         scene=place,
         device=device,
-        slave=SimulatedSlave(chosen.arm, chosen.q, place, seed=seed),
+        slave=SimulatedSlave(chosen.arm, chosen.q, place, seed=seed, stiffest=stiffest),
         master=MasterSide(
             3,
             device.force_limit,
