@@ -23,6 +23,9 @@ Progress: TypeAlias = Callable[[float, float], None]
 
 PERIOD = 1e-3
 """[s]"""
+HAND = 40.0
+"""bandwidth with which the hand's force is told by that of the device [rad/s]: a light device moves as the two are not
+equal, and a hand's own will is slower"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +167,7 @@ def run(
     there, back = (FaultyLine(faults or Faults(), seed + k) for k in range(2))
     sent = [0, 0]
     start = slave.x.copy()
+    hand = np.zeros(3)
     reason, heard = "", False
     picked: float | None = None
     picked_at = 0.0
@@ -174,9 +178,9 @@ def run(
             if (answer := boxes["master"].open(packet, now)) is not None:
                 master_side.receive(answer)
         x, v = device.read()
-        command = master_side.step(
-            x, v, PERIOD, now, hand=-out.force[k - 1] if k else None, closed=closed(time)
-        )
+        if k:
+            hand = hand - math.expm1(-HAND * PERIOD) * (-out.force[k - 1] - hand)
+        command = master_side.step(x, v, PERIOD, now, hand=hand, closed=closed(time))
         packet = boxes["master"].seal(master_side.message(), now)
         sent[0] += len(packet) + 28
         there.send(packet, now)
