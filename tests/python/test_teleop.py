@@ -130,7 +130,7 @@ def test_keys_and_sticks_make_a_smooth_bounded_motion() -> None:
     assert keys.press("w") and keys.press("a") and not keys.press("?")
     last = np.zeros(3)
     for _ in range(500):
-        keys.step(H)
+        keys.step(np.zeros(3), H)
         _, v = keys.read()
         assert np.linalg.norm(v) <= 0.1 + 1e-12 and np.linalg.norm(v - last) < 0.003
         last = v
@@ -139,7 +139,7 @@ def test_keys_and_sticks_make_a_smooth_bounded_motion() -> None:
     keys.release("a")
     keys.stick(0.0, float("nan"), -5.0)
     for _ in range(500):
-        keys.step(H)
+        keys.step(np.zeros(3), H)
     assert keys.read()[1] == pytest.approx([0.0, 0.0, -0.1], abs=1e-4)
 
 
