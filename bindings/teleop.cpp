@@ -1,6 +1,8 @@
 // Teleoperation: the two sides, and whole episodes of a simulated teleoperator.
 #include "common.hpp"
 
+#include <chrono>
+
 #include "palpate/teleop/episode.hpp"
 
 using namespace palpate;
@@ -18,13 +20,14 @@ nb::dict message(const Message& m, int n) {
   out["velocity"] = array(m.velocity, n);
   out["force"] = array(m.force, n);
   out["energy"] = m.energy;
+  out["booked"] = m.booked;
   out["level"] = m.level;
   out["engaged"] = m.engaged;
   return out;
 }
 Message message(std::uint64_t session, std::uint64_t sequence, std::int64_t time_ns, const Vector& position, const Vector& velocity, const Vector& force, double energy,
-                double level, bool engaged, int n) {
-  return {session, sequence, time_ns, joints(position, n, "position"), joints(velocity, n, "velocity"), joints(force, n, "force"), energy, level, engaged};
+                double booked, double level, bool engaged, int n) {
+  return {session, sequence, time_ns, joints(position, n, "position"), joints(velocity, n, "velocity"), joints(force, n, "force"), energy, booked, level, engaged};
 }
 nb::dict tank(const EnergyTank& t) {
   nb::dict out;
@@ -33,6 +36,7 @@ nb::dict tank(const EnergyTank& t) {
   out["given"] = t.given();
   out["sent"] = t.sent();
   out["received"] = t.received();
+  out["booked"] = t.booked();
   out["dissipated"] = t.dissipated();
   out["lowest"] = t.lowest();
   return out;
@@ -57,9 +61,9 @@ struct PySlave {
 template <class Py>
 void bind_side(nb::class_<Py>& type) {
   type.def("receive", [](Py& self, std::uint64_t session, std::uint64_t sequence, std::int64_t time_ns, const Vector& position, const Vector& velocity, const Vector& force,
-                         double energy, double level, bool engaged) {
-        return self.side.receive(message(session, sequence, time_ns, position, velocity, force, energy, level, engaged, self.n));
-      }, nb::arg("session"), nb::arg("sequence"), nb::arg("time_ns"), nb::arg("position"), nb::arg("velocity"), nb::arg("force"), nb::arg("energy"), nb::arg("level"),
+                         double energy, double booked, double level, bool engaged) {
+        return self.side.receive(message(session, sequence, time_ns, position, velocity, force, energy, booked, level, engaged, self.n));
+      }, nb::arg("session"), nb::arg("sequence"), nb::arg("time_ns"), nb::arg("position"), nb::arg("velocity"), nb::arg("force"), nb::arg("energy"), nb::arg("booked"), nb::arg("level"),
            nb::arg("engaged"), "A message of the other side, as it came; False: old or broken, not used.")
       .def("message", [](const Py& self) { return message(self.side.message(), self.n); }, "To be sent after each step.")
       .def("begin", [](Py& self, std::uint64_t session) { self.side.begin(session); }, nb::arg("session"))
@@ -102,6 +106,54 @@ nb::dict plain(const EpisodeResult& r) {
   out["contact"] = r.contact;
   out["finite"] = r.finite;
   return out;
+}
+
+/// How long each of `calls` steps of both sides takes [s]: six axes, four-channel, a message every step both ways. The time
+/// of reading the clock is in it.
+void step_times(std::size_t calls, double* master_s, double* slave_s) {
+  MasterConfig mc;
+  SlaveConfig sc;
+  mc.coupling = sc.coupling = Coupling::four_channel;
+  mc.force_limit.fill(8.5);
+  mc.stiffness.fill(300.0);
+  mc.damping.fill(5.0);
+  mc.fill.fill(1.0);
+  mc.acceleration.fill(50.0);
+  mc.resync_rate.fill(150.0);
+  sc.lower.fill(-1.0);
+  sc.upper.fill(1.0);
+  sc.speed.fill(0.5);
+  sc.acceleration.fill(20.0);
+  sc.resync_speed.fill(0.05);
+  sc.resync_acceleration.fill(0.2);
+  sc.force_limit.fill(50.0);
+  MasterSide master(6, mc);
+  SlaveSide slave(6, sc);
+  master.begin(1);
+  slave.begin(1);
+  using Clock = std::chrono::steady_clock;
+  const auto seconds = [](Clock::duration d) { return std::chrono::duration<double>(d).count(); };
+  JointVector x{}, v{}, hand{}, at{}, force{}, std{};
+  std.fill(0.1);
+  for (std::size_t k = 0; k < calls; ++k) {
+    const double t = 1e-3 * static_cast<double>(k);
+    for (std::size_t i = 0; i < 6; ++i) {
+      x[i] = 0.05 * std::sin(3.0 * t + static_cast<double>(i));
+      v[i] = 0.15 * std::cos(3.0 * t + static_cast<double>(i));
+      force[i] = -2000.0 * std::max(0.0, at[i] - 0.02);
+    }
+    const auto a = Clock::now();
+    const MasterCommand felt = master.step(x, v, hand, true, 1e-3);
+    const auto b = Clock::now();
+    const SlaveCommand command = slave.step(at, v, force, force, std, true, 1e-3);
+    const auto c = Clock::now();
+    master_s[k] = seconds(b - a);
+    slave_s[k] = seconds(c - b);
+    for (std::size_t i = 0; i < 6; ++i) hand[i] = -felt.force[i];
+    at = command.position;
+    slave.receive(master.message());
+    master.receive(slave.message());
+  }
 }
 
 }  // namespace
@@ -205,6 +257,11 @@ void bind_teleop(nb::module_& m) {
     for (std::size_t i = 0; i < n; ++i) out.data[i] = felt(force.data()[i], std.data()[i]);
     return out.array;
   }, nb::arg("force"), nb::arg("std"), nb::arg("threshold"));
+  m.def("teleop_step_times", [](std::size_t calls) {
+    Output<double> felt({calls}), followed({calls});
+    unlocked([&] { step_times(calls, felt.data, followed.data); });
+    return nb::make_tuple(felt.array, followed.array);
+  }, nb::arg("calls"), "How long each of so many steps takes: (master (calls,), slave (calls,)) [s]; six axes, four-channel.");
   m.def("teleop_episode", [](std::uint64_t seed, const std::string& layer) {
     expect(layer == "none" || layer == "tanks" || layer == "waves", "layer '" + layer + "'; choose from none, tanks, waves");
     EpisodeConfig c = random_episode(seed);

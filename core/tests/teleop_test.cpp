@@ -104,7 +104,7 @@ TEST(TeleopTank, NothingThatTheNetworkDoesMakesEnergy) {
       for (auto [self, way] : {std::pair{&a, &way_a}, std::pair{&b, &way_b}}) {
         const double work = r(-0.02, 0.02);
         self->exchange(std::max(work, -std::max(0.0, self->level())));
-        self->give(r(0.0, 0.3), T);
+        self->give(r(0.0, 0.3), self->sent() - r(0.0, 0.3), T);
         for (int copies = static_cast<int>(r(0.0, 3.0)); copies > 0; --copies) way->push_back(self->sent());  // lost, once, twice
       }
       for (auto [self, way] : {std::pair{&a, &way_b}, std::pair{&b, &way_a}})
@@ -115,6 +115,30 @@ TEST(TeleopTank, NothingThatTheNetworkDoesMakesEnergy) {
       EXPECT_LE(a.received(), b.sent() + 1e-12);
     }
   }
+}
+
+TEST(TeleopTank, TheLineIsNoStoreHoweverLongItIs) {
+  // both take as much as they can for ten seconds; the line delays by half a second, and what it holds stays bounded
+  EnergyTank a, b;
+  struct Told { double sent, booked, level; };
+  std::vector<Told> from_a(500), from_b(500);
+  const double most = a.config().most;
+  for (std::size_t k = 0; k < 10000; ++k) {
+    const Told at_b = from_a[k % 500], at_a = from_b[k % 500];
+    a.receive(at_a.sent);
+    b.receive(at_b.sent);
+    a.exchange(0.01);
+    b.exchange(0.01);
+    a.give(at_a.level, at_a.booked, T);
+    b.give(at_b.level, at_b.booked, T);
+    from_a[k % 500] = {a.sent(), a.booked(), a.level()};
+    from_b[k % 500] = {b.sent(), b.booked(), b.level()};
+    EXPECT_LE(a.level(), most + 1e-12);
+    EXPECT_LE(b.level(), most + 1e-12);
+    EXPECT_LE(a.sent() - b.received(), most + 1e-12);
+    EXPECT_LE(b.sent() - a.received(), most + 1e-12);
+  }
+  EXPECT_GT(a.received(), 0.1);  // and yet it gives
 }
 
 TEST(TeleopTank, ANewSessionGivesNothingThatWasGivenBefore) {

@@ -95,7 +95,7 @@ def test_a_restarted_side_gives_no_energy_twice_and_old_messages_are_left() -> N
     for k in range(100):
         exchange(master, slave, 0.0, 0.0, 0.0, 0.0, k)
     late = master.message()
-    rich = Message(2, 1, 0, np.zeros(1), np.zeros(1), np.zeros(1), 5.0, 1.0, True)
+    rich = Message(2, 1, 0, np.zeros(1), np.zeros(1), np.zeros(1), 5.0, 0.0, 1.0, True)
     assert slave.receive(rich)
     slave.step(np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1), H, 0)
     assert slave.tank()["level"] <= _core.TankOptions().initial + 1e-9
@@ -130,7 +130,7 @@ def test_keys_and_sticks_make_a_smooth_bounded_motion() -> None:
     assert keys.press("w") and keys.press("a") and not keys.press("?")
     last = np.zeros(3)
     for _ in range(500):
-        keys.step(H)
+        keys.step(np.zeros(3), H)
         _, v = keys.read()
         assert np.linalg.norm(v) <= 0.1 + 1e-12 and np.linalg.norm(v - last) < 0.003
         last = v
@@ -139,7 +139,7 @@ def test_keys_and_sticks_make_a_smooth_bounded_motion() -> None:
     keys.release("a")
     keys.stick(0.0, float("nan"), -5.0)
     for _ in range(500):
-        keys.step(H)
+        keys.step(np.zeros(3), H)
     assert keys.read()[1] == pytest.approx([0.0, 0.0, -0.1], abs=1e-4)
 
 

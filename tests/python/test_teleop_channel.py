@@ -25,7 +25,7 @@ MS = 1_000_000
 
 
 def message(sequence: int, session: int = 1, n: int = 3, value: float = 0.5) -> Message:
-    return Message(session, sequence, 0, np.full(n, value), np.zeros(n), np.full(n, -value), 0.1, 0.2, True)
+    return Message(session, sequence, 0, np.full(n, value), np.zeros(n), np.full(n, -value), 0.1, 0.15, 0.2, True)
 
 
 class Two:
@@ -55,7 +55,7 @@ def test_the_two_meet_and_every_number_arrives_bit_for_bit() -> None:
     got = two.exchange()[0]
     assert got is not None and got.sequence == 3 and got.session == 100 and got.engaged
     assert np.array_equal(got.position, np.full(3, 0.5)) and np.array_equal(got.force, np.full(3, -0.5))
-    assert (got.energy, got.level) == (0.1, 0.2)
+    assert (got.energy, got.booked, got.level) == (0.1, 0.15, 0.2)
     assert not two.master.refusals() and not two.slave.refusals()
 
 
@@ -163,7 +163,7 @@ def test_no_changed_packet_passes(data: st.DataObject) -> None:
 @given(st.binary(max_size=700), st.booleans())
 def test_noise_is_refused(noise: bytes, like_ours: bool) -> None:
     sealer = Sealer(KEY, "slave", 1, 3)
-    assert sealer.open(b"PT\x01\x01" + noise if like_ours else noise, 0) is None
+    assert sealer.open(b"PT\x02\x01" + noise if like_ours else noise, 0) is None
     assert sealer.reason
 
 
@@ -251,7 +251,7 @@ with UdpChannel(bytes(range(32)), "master", 3, peer=("127.0.0.1", port)) as chan
     end, count, heard = time.monotonic() + 60.0, 0, 0
     while heard < 50 and time.monotonic() < end:
         count += 1
-        channel.send(Message(channel.session, count, 0, np.full(3, count), np.zeros(3), np.zeros(3), 0.0, 0.0, True))
+        channel.send(Message(channel.session, count, 0, np.full(3, count), np.zeros(3), np.zeros(3), 0.0, 0.0, 0.0, True))
         heard += len(channel.receive())
         time.sleep(0.001)
 print(heard)
@@ -278,7 +278,7 @@ def test_two_processes_meet() -> None:
 
 def test_the_packet_says_what_the_module_says() -> None:
     packet = Sealer(KEY, "slave", 1, 3).seal(message(1), 0)
-    assert packet[:4] == b"PT\x01\x02" and len(packet) == 28 + 50 + 72 + 16
+    assert packet[:4] == b"PT\x02\x02" and len(packet) == 28 + 58 + 72 + 16
     assert module.LONGEST >= len(Sealer(KEY, "slave", 1, 16).seal(message(1, n=16), 0))
 
 
@@ -292,7 +292,7 @@ with UdpChannel(key, "slave", 3) as slave, UdpChannel(key, "master", 3, peer=sla
     while heard < 100 and time.monotonic() < end:
         count += 1
         for side in (master, slave):
-            side.send(Message(side.session, count, 0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0.0, True))
+            side.send(Message(side.session, count, 0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0.0, 0.0, True))
         heard += len(slave.receive())
         master.receive()
         time.sleep(0.001)

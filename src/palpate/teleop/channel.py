@@ -3,7 +3,7 @@
 A packet is a header in the clear and a body sealed with ChaCha20-Poly1305 (RFC 8439), whose tag covers both::
 
     "PT"  version u8  role u8 | salt 8 bytes | session u64 | sequence u64 | sealed body | tag 16 bytes
-    body: echo 8 bytes | time i64 | echo_time i64 | echo_age i64 | n u8 | flags u8 | energy f64 | level f64 | 3 n f64
+    body: echo 8 bytes | time i64 | echo_time i64 | echo_age i64 | n u8 | flags u8 | energy, booked, level f64 | 3 n f64 | reason
 
 The key of a direction in a run is HKDF-SHA256(shared key, salt, role), so a sequence number, which is the nonce,
 never meets a key
@@ -34,7 +34,7 @@ import numpy as np
 from ..arm import Array
 from ..errors import InputError, MissingExtraError, PalpateError
 
-VERSION = 1
+VERSION = 2
 """of the packets; a side with another one is refused"""
 MAX_CLOCK_OFFSET = 30.0
 """clocks further apart than this are refused [s]: the recording of both sides would make no sense"""
@@ -44,12 +44,13 @@ WINDOW = 1024
 Role: TypeAlias = Literal["master", "slave"]
 
 _HEADER = struct.Struct(">2sBB8sQQ")
-_BODY = struct.Struct(">8sqqqBBdd")
+_BODY = struct.Struct(">8sqqqBBddd")
 _TAG = 16
 _NOBODY = bytes(8)
 _SILENCE_NS = 1_000_000_000
 _MOST_AXES = 16
-LONGEST = _HEADER.size + _BODY.size + 24 * _MOST_AXES + _TAG
+_MOST_WORDS = 120
+LONGEST = _HEADER.size + _BODY.size + 24 * _MOST_AXES + _MOST_WORDS + _TAG
 """[byte]"""
 
 
@@ -75,10 +76,14 @@ class Message:
     """(n,) [N] or [N m]"""
     energy: float
     """sent since the session began [J]"""
+    booked: float
+    """of what the other side has sent: the rest is still on its way [J]"""
     level: float
     """of the sender's tank [J]"""
     engaged: bool
     """the sender wants to be coupled"""
+    reason: str = ""
+    """what holds the sender or slows it down, for people; cut at 120 bytes"""
 
 
 # --- keys -------------------------------------------------------------------------------------------------------------
@@ -114,7 +119,7 @@ def read_key(path: str | os.PathLike[str]) -> bytes:
         text = target.read_text(encoding="ascii").strip()
     except OSError as error:
         raise ChannelError(
-            f"{target}: cannot be read: {error.strerror or error}; palpate teleop --new-key FILE makes one"
+            f"{target}: cannot be read: {error.strerror or error}; palpate teleop key FILE makes one"
         ) from None
     except UnicodeDecodeError:
         text = ""
@@ -128,7 +133,7 @@ def read_key(path: str | os.PathLike[str]) -> bytes:
         key = b""
     if len(key) != 32:
         raise ChannelError(
-            f"{target}: expected a key of 64 hexadecimal digits; palpate teleop --new-key FILE makes one"
+            f"{target}: expected a key of 64 hexadecimal digits; palpate teleop key FILE makes one"
         )
     return key
 
@@ -192,6 +197,7 @@ class Sealer:
         self._peer_session = 0
         self._ciphers: dict[bytes, Any] = {}
         self._newest, self._seen = 0, 0
+        self._first, self._taken = 1, 0
         self._heard: tuple[int, int] | None = None
         self.clock = Clock()
         self.refused: Counter[str] = Counter()
@@ -225,10 +231,12 @@ class Sealer:
             self.n,
             int(message.engaged),
             message.energy,
+            message.booked,
             message.level,
         )
         header = _HEADER.pack(b"PT", VERSION, _number(self.role), self.salt, self.session, message.sequence)
-        return header + self._out.encrypt(_nonce(message.sequence), body + rows.tobytes(), header)
+        body += rows.tobytes() + message.reason.encode()[:_MOST_WORDS]
+        return header + self._out.encrypt(_nonce(message.sequence), body, header)
 
     def open(self, packet: bytes, now_ns: int) -> Message | None:
         """The message of a packet that came; None if it is refused (see :attr:`refused`) or a greeting."""
@@ -255,8 +263,9 @@ class Sealer:
             )
         if len(body) < _BODY.size:
             return self._refused("length", f"a body of {len(body)} bytes")
-        echo, sent_ns, echo_time, echo_age, n, flags, energy, level = _BODY.unpack(body[: _BODY.size])
-        if n != self.n or len(body) != _BODY.size + 24 * n:
+        echo, sent_ns, echo_time, echo_age, n, flags, *energies = _BODY.unpack(body[: _BODY.size])
+        end = _BODY.size + 24 * n
+        if n != self.n or not end <= len(body) <= end + _MOST_WORDS:
             return self._refused("axes", f"the other side has {n} axes, this one {self.n}")
         if echo != self.salt:
             # Whoever is there now will hear our salt and echo it; what was recorded never will. A live side is not
@@ -267,11 +276,13 @@ class Sealer:
         if salt != self._peer_salt:
             self._peer_salt, self._peer_session, self._echo = salt, session, salt
             self._newest, self._seen, self._heard = 0, 0, None
+            self._first, self._taken = sequence, 0
             self.clock = Clock()
         if not self._fresh(sequence):
             return self._refused(
                 "replayed", f"number {sequence} has come before, or is far behind: replayed or repeated"
             )
+        self._taken += 1
         if echo_age >= 0:
             self.clock.take(echo_time, sent_ns - echo_age, sent_ns, now_ns)
         self._heard = (sent_ns, now_ns)
@@ -281,8 +292,8 @@ class Sealer:
                 f"the clocks differ by {self.clock.offset:+.0f} s: set them (chrony, NTP); at most "
                 f"{MAX_CLOCK_OFFSET:g} s are allowed",
             )
-        values = np.frombuffer(body, dtype=">f8", offset=_BODY.size).astype(np.float64)
-        if not (np.isfinite(values).all() and math.isfinite(energy) and math.isfinite(level)):
+        values = np.frombuffer(body[:end], dtype=">f8", offset=_BODY.size).astype(np.float64)
+        if not (np.isfinite(values).all() and all(map(math.isfinite, energies))):
             return self._refused("not finite", "a number is not finite")
         return Message(
             session,
@@ -291,9 +302,9 @@ class Sealer:
             values[:n],
             values[n : 2 * n],
             values[2 * n :],
-            energy,
-            level,
-            bool(flags & 1),
+            *energies,
+            engaged=bool(flags & 1),
+            reason="".join(c for c in body[end:].decode(errors="ignore") if c.isprintable()),
         )
 
     def _cipher(self, salt: bytes) -> Any:
@@ -320,8 +331,15 @@ class Sealer:
     def _refused(self, kind: str, reason: str) -> Message | None:
         """No message, and why."""
         self.refused[kind] += 1
-        self.reason = reason
+        if kind != "greeting":
+            self.reason = reason
         return None
+
+    def lost(self) -> float:
+        """Part of the other side's packets of this run that have not come [1]; NaN: it has not been met."""
+        if not self._taken:
+            return math.nan
+        return max(0.0, 1.0 - self._taken / max(1, self._newest - self._first + 1))
 
     def refusals(self) -> dict[str, int]:
         """Packets that were refused, by reason; greetings are none."""

@@ -99,12 +99,12 @@ class _Side:
 
     def receive(self, message: Message) -> bool:
         """Take a message of the other side; False: it is old or broken, and was not used."""
-        values = {f.name: getattr(message, f.name) for f in dataclasses.fields(message)}
+        values = {f.name: getattr(message, f.name) for f in dataclasses.fields(message) if f.name != "reason"}
         return bool(self._core.receive(**values))
 
-    def message(self) -> Message:
-        """To be sent after each step."""
-        return Message(**self._core.message())
+    def message(self, reason: str = "") -> Message:
+        """To be sent after each step, with what holds this side, for people."""
+        return Message(**self._core.message(), reason=reason)
 
     @property
     def alive(self) -> bool:

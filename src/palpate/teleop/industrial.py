@@ -111,7 +111,7 @@ class IndustrialSlave(InScene):
         self._x = self._x + h * self._v
         return super().follow(self._x, self._v, push)
 
-    def _torque(self, ddq_ref: Array) -> Array:
+    def _torque(self, J: Array, ddq_ref: Array, pushed: Array) -> Array:
         B, plant = self._drives.B, self.plant
         kp, kd, ki = self._gains
         error = B @ (self._q_ref - plant.q)
@@ -119,4 +119,4 @@ class IndustrialSlave(InScene):
         rigid = self.model.inverse_dynamics(self._q_ref, self._dq_ref, ddq_ref) @ self._inverse
         motor = rigid + self._drives.inertia * (B @ ddq_ref)
         motor = motor + kp * error + kd * (B @ (self._dq_ref - plant.dq)) + ki * self._integral
-        return motor @ B
+        return motor @ B + pushed

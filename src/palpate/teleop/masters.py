@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
+import select
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -54,6 +59,24 @@ class Hand:
         return pull
 
 
+class Device(Protocol):
+    """What a hand holds: three axes, or the joints of a leader arm [rad, N m]."""
+
+    @property
+    def force_limit(self) -> float | Array:
+        """Largest force on the hand, one number or one per axis [N]."""
+
+    def read(self) -> tuple[Array, Array]:
+        """(3,) place [m], (3,) velocity [m/s].
+
+        Raises:
+            DriverError: it is gone.
+        """
+
+    def step(self, force: Array, dt: float) -> None:
+        """Hold a force (3,) [N] of the device on the hand for a period [s]."""
+
+
 @dataclass(slots=True)
 class HapticDevice:
     """A simulated desktop device with three force axes, held by a :class:`Hand`.
@@ -94,6 +117,59 @@ class HapticDevice:
         return np.round(self.x / self.resolution) * self.resolution, self.v.copy()
 
 
+class TerminalKeys:
+    """Keys of the terminal: each moves while it repeats, for a terminal tells no release.
+
+    Args:
+        keys: what they move.
+        hold: how long a key counts after it was seen [s]; longer than the pause before a keyboard repeats it.
+
+    Raises:
+        InputError: there is no terminal.
+    """
+
+    def __init__(self, keys: Keys, hold: float = 0.5) -> None:
+        if not sys.stdin.isatty():
+            raise InputError("--device keys needs a terminal to read keys from; this input is none")
+        self._keys, self._hold = keys, hold
+        self._down: dict[str, float] = {}
+        self.force_limit = keys.force_limit
+
+    def __enter__(self) -> Self:
+        import termios
+        import tty
+
+        self._before = termios.tcgetattr(sys.stdin)
+        tty.setcbreak(sys.stdin)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        import termios
+
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
+
+    def read(self) -> tuple[Array, Array]:
+        """(3,) place [m], (3,) velocity [m/s]."""
+        return self._keys.read()
+
+    def step(self, force: Array, dt: float) -> None:
+        """Take the keys that were pressed, and go on by a period [s]."""
+        while select.select([sys.stdin], [], [], 0.0)[0]:
+            key = os.read(sys.stdin.fileno(), 1).decode(errors="ignore").lower()
+            if not key:
+                break
+            if self._keys.press(key):
+                self._down[key] = self._hold
+        for key in list(self._down):
+            self._down[key] -= dt
+            if self._down[key] <= 0.0:
+                del self._down[key]
+                self._keys.release(key)
+        self._keys.step(force, dt)
+
+
 class Keys:
     """Keyboard, gamepad or SpaceMouse as a master: buttons and sticks give a velocity; what is felt can only be shown.
 
@@ -124,6 +200,8 @@ class Keys:
         self._bindings = dict(self.BINDINGS if bindings is None else bindings)
         self._down: set[str] = set()
         self._stick = np.zeros(3)
+        self.force_limit = 8.5
+        """what is told as felt, at most [N]"""
         self._x, self._v = np.zeros(3), np.zeros(3)
 
     def press(self, key: str) -> bool:
@@ -140,8 +218,8 @@ class Keys:
         """Sticks of a gamepad or the cap of a SpaceMouse, each from -1 to 1."""
         self._stick = np.clip(np.nan_to_num([x, y, z]), -1.0, 1.0)
 
-    def step(self, dt: float) -> None:
-        """Go on by a period [s]."""
+    def step(self, force: Array, dt: float) -> None:
+        """Go on by a period [s]; keys cannot push back."""
         wanted = sum((np.array(self._bindings[k]) for k in self._down), self._stick)
         size = float(np.linalg.norm(wanted))
         wanted = self._speed * wanted / max(1.0, size)

@@ -13,7 +13,7 @@ from ..arm import Arm, Array, Sensing, Shape
 from ..errors import InputError, suggest
 from ..simulate._model import mujoco
 
-SceneName: TypeAlias = Literal["wall", "surface", "peg", "lift"]
+SceneName: TypeAlias = Literal["wall", "rigid", "surface", "peg", "lift"]
 
 SlaveKind: TypeAlias = Literal["torque", "phase_currents", "servos"]
 
@@ -88,7 +88,7 @@ def find(
     """The scene of that name, placed for a tool whose tip is at `tip` (3,) [m] in the slave's base frame.
 
     Args:
-        name: wall, surface, peg or lift.
+        name: wall, rigid, surface, peg or lift.
         tip: (3,) [m].
         stiffness: of the wall [N/m].
         press: how far the hand goes beyond the touch [m].
@@ -99,6 +99,7 @@ def find(
     """
     makers: dict[str, Callable[[], Scene]] = {
         "wall": lambda: _wall(tip, stiffness, press),
+        "rigid": lambda: _wall(tip, None, press),
         "surface": lambda: _surface(tip, press),
         "peg": lambda: _peg(tip),
         "lift": lambda: _lift(masses),
@@ -153,24 +154,23 @@ def _box(
     )
 
 
-def _wall(tip: Array, stiffness: float, press: float) -> Scene:
+def _wall(tip: Array, stiffness: float | None, press: float) -> Scene:
+    """On a spring [N/m], or as rigid as MuJoCo's contacts are."""
     gap = 0.05
+    axes = () if stiffness is None else ((1.0, 0.0, 0.0),)
 
     def build(spec: Any) -> None:
-        panel = _sprung(
-            spec,
-            "panel",
-            (tip[0] + gap + PROBE + 0.01, tip[1], tip[2]),
-            _UPRIGHT,
-            ((1.0, 0.0, 0.0),),
-            stiffness,
-        )
+        place = (tip[0] + gap + PROBE + 0.01, tip[1], tip[2])
+        panel = _sprung(spec, "panel", place, _UPRIGHT, axes, stiffness or 0.0)
         _box(panel, (0.01, 0.1, 0.05), (0.0, 0.0, 0.0), (0.55, 0.68, 0.5, 1.0))
 
     deep = gap + press
     path = through(
         [(2.0, (0.0, 0.0, 0.0)), (3.5, (deep, 0.0, 0.0)), (6.5, (deep, 0.0, 0.0)), (8.5, (0.0, 0.0, 0.0))]
     )
+    if stiffness is None:
+        text = f"press a rigid wall as if it gave way by {1e3 * press:g} mm, and come back"
+        return Scene("rigid", text, build, 0, None, path, 9.5)
     text = f"press a wall on a spring of {stiffness:g} N/m, {1e3 * press:g} mm deep, and come back"
     return Scene("wall", text, build, 1, stiffness, path, 9.5)
 

@@ -14,18 +14,13 @@ import numpy.typing as npt
 from ..arm import Array
 from ..errors import InputError
 from .channel import Faults, FaultyLine, Sealer
-from .coupling import Event, MasterSide, SlaveSide, felt_force
-from .masters import HapticDevice
-from .servo_arms import LeaderArm
+from .coupling import Event, MasterSide, SlaveSide
+from .ends import PERIOD, MasterEnd, SlaveEnd
+from .masters import Device
 from .slaves import InScene
 
-Master: TypeAlias = HapticDevice | LeaderArm
-"""what a hand holds"""
 Progress: TypeAlias = Callable[[float, float], None]
 """told the simulated time and the whole time [s], now and then"""
-
-PERIOD = 1e-3
-"""[s]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +123,7 @@ def _weighs(since: float, force: Array, std: Array) -> bool:
 
 
 def run(
-    device: Master,
+    device: Device,
     slave: InScene,
     master_side: MasterSide,
     slave_side: SlaveSide,
@@ -156,7 +151,7 @@ def run(
         faults: of the network, each way; None: none.
         cuts: when the link is dead.
         closed: the clutch at a time [s].
-        weigh: weigh what is lifted, from the force at rest.
+        weigh: weigh what is lifted.
         progress: told how far it is.
         stop: asked now and then; True ends the run there.
         seed: of the faults and the packets' salts.
@@ -177,6 +172,7 @@ def run(
     there, back = (FaultyLine(faults or Faults(), seed + k) for k in range(2))
     sent = [0, 0]
     start = slave.x.copy()
+    master, follower = MasterEnd(device, master_side), SlaveEnd(slave, slave_side)
     reason, heard = "", False
     picked: float | None = None
     picked_at = 0.0
@@ -186,27 +182,19 @@ def run(
         for packet in back.receive(now):
             if (answer := boxes["master"].open(packet, now)) is not None:
                 master_side.receive(answer)
-        x, v = device.read()
-        command = master_side.step(
-            x, v, PERIOD, now, hand=-out.force[k - 1] if k else None, closed=closed(time)
-        )
+        master.closed = closed(time)
+        command = master.step(now)
         packet = boxes["master"].seal(master_side.message(), now)
         sent[0] += len(packet) + 28
         there.send(packet, now)
 
         if (mass := slave.advance(time)) is not None:
             picked, picked_at = mass, time
-        seen = slave.read()
         for packet in there.receive(now):
             if (told := boxes["slave"].open(packet, now)) is not None:
                 slave_side.receive(told)
-        # noise is no work: the reference pays for what is felt
-        std = seen.std if seen.felt_std is None else seen.felt_std
-        port = felt_force(seen.force, std, slave_side.threshold)
-        reference = slave_side.step(
-            seen.x, seen.v, seen.force, std, PERIOD, now, port=port, allowed=seen.usable
-        )
-        slave.follow(reference.position, reference.velocity, reference.force)
+        reference = follower.step(now)
+        seen = follower.seen
         packet = boxes["slave"].seal(slave_side.message(), now)
         sent[1] += len(packet) + 28
         back.send(packet, now)
@@ -223,7 +211,7 @@ def run(
             slave.hold(0.0)
             picked = None
 
-        out.device[k], out.device_velocity[k] = x, v
+        out.device[k], out.device_velocity[k] = master.x, master.v
         out.force[k], out.felt[k] = command.force, command.felt
         out.tip[k], out.tip_velocity[k], out.reference[k] = seen.x, seen.v, reference.position
         out.estimated[k], out.std[k] = seen.force, seen.std
@@ -231,9 +219,7 @@ def run(
         out.master_events[k], out.slave_events[k] = command.events, reference.events
         out.q[k], out.effort[k] = seen.q, slave.driver.plant.torque
         out.levels[k] = master_side.tank()["level"], slave_side.tank()["level"]
-        now_reason = seen.reason or (
-            "end of the slave's workspace" if reference.events & Event.WORKSPACE else ""
-        )
+        now_reason = master.reason or follower.reason
         silent = bool((command.events | reference.events) & Event.LINK)
         heard = heard or not silent
         now_reason = "the link is dead: both hold" if heard and silent else now_reason
@@ -241,7 +227,6 @@ def run(
             reason = now_reason
             if reason:
                 out.reasons.append((time, reason))
-        device.step(command.force, PERIOD)
         if k % 200 == 199:
             if progress is not None:
                 progress(time + PERIOD, seconds)

@@ -11,11 +11,11 @@ from ..arm import Array
 from .channel import Faults
 from .coupling import CouplingName, MasterSide, SlaveSide
 from .industrial import IndustrialSlave
-from .masters import Hand, HapticDevice
+from .masters import Device, Hand, HapticDevice
 from .scenes import Scene, SlaveArm, find, slave_arm
 from .servo_arms import ServoSlave, SimulatedLeader, joint_path
-from .session import Cut, Master, Progress, Run, run
-from .slaves import InScene, SimulatedSlave
+from .session import Cut, Progress, Run, run
+from .slaves import STIFFEST, InScene, SimulatedSlave
 
 TANK = {"initial": 0.05, "desired": 0.1, "most": 0.5}
 """of both sides [J]: what a hand gives that presses 5 N over 2 cm; without an initial charge the first touch finds
@@ -48,7 +48,7 @@ class Setup:
     """
 
     scene: Scene | None
-    device: Master
+    device: Device
     slave: InScene
     master: MasterSide
     follower: SlaveSide
@@ -96,12 +96,13 @@ def build(
     force_scale: float | None = None,
     hand: Hand | None = None,
     passive: bool = True,
+    stiffest: float = STIFFEST,
     seed: int = 0,
 ) -> Setup:
     """A haptic device and an arm in a scene.
 
     Args:
-        scene: wall, surface, peg, lift, or None for free motion.
+        scene: wall, rigid, surface, peg, lift, or None for free motion.
         arm: the slave, see :func:`palpate.teleop.scenes.slave_arm`.
         coupling: "force_position", "position_position" or "four_channel".
         stiffness: of the wall [N/m].
@@ -111,6 +112,7 @@ def build(
         force_scale: force felt per force of the environment [1]; None: what suits device and arm.
         hand: who holds the device; None: the scene's script.
         passive: the passivity layer.
+        stiffest: beyond this stiffness of what it touches the slave gives way [N/m]; infinite: it never does.
         seed: of the sensors' noise.
 
     Raises:
@@ -134,8 +136,10 @@ def build(
     return Setup(
         scene=place,
         device=device,
-        slave=(IndustrialSlave if chosen.kind == "phase_currents" else SimulatedSlave)(
-            chosen.arm, chosen.q, place, seed=seed
+        slave=(
+            IndustrialSlave(chosen.arm, chosen.q, place, seed=seed)
+            if chosen.kind == "phase_currents"
+            else SimulatedSlave(chosen.arm, chosen.q, place, seed=seed, stiffest=stiffest)
         ),
         master=MasterSide(
             3,

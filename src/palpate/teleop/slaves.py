@@ -31,6 +31,16 @@ _SINGULAR = 0.08
 STIFFENING = 40.0
 """bandwidth with which the external torque is taken off [rad/s]: well below the observer's, which is half a period
 late"""
+STIFFEST = 8000.0
+"""what the coupling may meet [N/m]: beyond it the arm gives way"""
+_TOUCHING = 5.0
+"""standard deviations of the force that are a touch [1]"""
+_CHANGES, _STEERING = 60.0, 100.0
+"""bandwidths above which changes tell a stiffness, and of what follows from it [rad/s]"""
+_LATELY, _FORGET = 0.05, 0.5
+"""time constant of the mean squares, and how long after a touch they are forgotten [s]"""
+_CHANGING = 1.0
+"""a force that changes by less says nothing of the stiffness [N]"""
 _JERKY = 20.0
 """acceleration of a joint's reference at most [rad/s^2]"""
 _SETTLE = 0.4
@@ -63,6 +73,54 @@ class Seen:
     felt_std: Array | None = None
 
 
+class Stiffness:
+    """How stiff what the tool touches is, and how much of its force may be taken off.
+
+    Taking the touch's force off makes the arm infinitely stiff, so that it goes where it is told through whatever
+    yields. Against what does not yield, it and the touch push each other to and fro with the lag of the estimate.
+    What is met is told by how far the place gives when the force changes, both through the same lag (least squares
+    with forgetting, the force being what is given; sliding has nothing to do with it and averages out)::
+
+        1/K = -LP(dx . dF) / LP(dF . dF),    share = clip(K_s / K, 0, 1)
+
+    dx, dF high-passed. Up to K_s, the stiffest, nothing changes; beyond it the arm gives way like a spring, and the
+    coupling never meets more. While the force changes by less than its noise the last value holds; half a second
+    after the touch it is forgotten.
+    """
+
+    def __init__(self, stiffest: float) -> None:
+        self._stiffest = stiffest
+        self._x: Array | None = None
+        self._slow_x = self._slow_F = np.zeros(3)
+        self._together = self._changes = 0.0
+        self._free = 0.0
+        self.share = 1.0
+        """part of the force that may be taken off [1]"""
+
+    def step(self, seen: Seen, h: float) -> None:
+        """A period of `h` [s] later."""
+        F = seen.force
+        self._x = seen.x if self._x is None else self._x - math.expm1(-OBSERVER * h) * (seen.x - self._x)
+        felt = bool(np.linalg.norm(F) > _TOUCHING * np.linalg.norm(seen.std))
+        self._free = 0.0 if felt else self._free + h
+        if not felt:
+            self._slow_x, self._slow_F = self._x, F
+            if self._free > _FORGET:
+                self._together = self._changes = 0.0
+                self.share = min(1.0, self.share + h / _FORGET)
+            return
+        mix = -math.expm1(-_CHANGES * h)
+        dx, dF = self._x - self._slow_x, F - self._slow_F
+        self._slow_x = self._slow_x + mix * dx
+        self._slow_F = self._slow_F + mix * dF
+        lately = -math.expm1(-h / _LATELY)
+        self._together += lately * (-float(dx @ dF) - self._together)
+        self._changes += lately * (float(dF @ dF) - self._changes)
+        if self._changes > _CHANGING**2:
+            share = min(1.0, max(0.0, self._stiffest * self._together / self._changes))
+            self.share -= math.expm1(-_STEERING * h) * (share - self.share)
+
+
 class ArmSlave:
     """Follows a reference of its tool's tip, keeping the tool's orientation, and estimates what touches it.
 
@@ -80,9 +138,22 @@ class ArmSlave:
         driver: the arm; connected and enabled here.
         model: the arm as it is known; None: the driver's plant is known exactly.
         held: mass in the hand that is known [kg]; NaN: none is.
+        stiffest: beyond this stiffness of what it touches the arm gives way [N/m]; infinite: it never does.
+
+    Raises:
+        InputError: `stiffest` is not positive.
     """
 
-    def __init__(self, driver: MujocoDriver, *, model: Arm | None = None, held: float = 0.0) -> None:
+    def __init__(
+        self,
+        driver: MujocoDriver,
+        *,
+        model: Arm | None = None,
+        held: float = 0.0,
+        stiffest: float = STIFFEST,
+    ) -> None:
+        if not stiffest > 0.0:
+            raise InputError(f"stiffest must be > 0 N/m, got {stiffest!r}")
         self.driver = driver
         self.model = driver.plant.arm if model is None else model
         arm = self.model
@@ -107,6 +178,7 @@ class ArmSlave:
         self._home = self._q_ref.copy()
         self._dq_ref = np.zeros(arm.n)
         self._taken_off = np.zeros(arm.n)
+        self._stiffest, self._stiffness = stiffest, Stiffness(stiffest)
         self._R0 = self._pose(self._q_ref)[0]
         self._reason = ""
         self.seen = self._see()
@@ -193,9 +265,8 @@ class ArmSlave:
             (n,) torque sent [N m]; zeros if the drives are off.
         """
         J, ddq_ref = self._lead(x_ref, v_ref)
-        torque = self._torque(ddq_ref)
-        if push is not None:
-            torque = torque + J[:3].T @ push
+        pushed = np.zeros(self.model.n) if push is None else J[:3].T @ push
+        torque = self._torque(J, ddq_ref, pushed)
         if self.driver.state != "enabled":
             return np.zeros(self.model.n)
         return self.driver.write(np.clip(torque, -self._effort, self._effort))
@@ -230,16 +301,36 @@ class ArmSlave:
         self._q_ref, self._dq_ref = np.clip(self._q_ref + h * rates, self._low, self._high), rates
         return J, ddq_ref
 
-    def _torque(self, ddq_ref: Array) -> Array:
-        """(n,) that takes the joints along their reference [N m]."""
+    def _torque(self, J: Array, ddq_ref: Array, pushed: Array) -> Array:
+        """(n,) that takes the joints along their reference, and `pushed` (n,) beside it [N m]."""
         seen, external, h = self.seen, self._touch.external, self._period
-        a = ddq_ref + BANDWIDTH**2 * (self._q_ref - seen.q) + 2.0 * BANDWIDTH * (self._dq_ref - seen.dq)
+        self._stiffness.step(seen, h)
+        share = self._stiffness.share
+        behind, ahead = self._q_ref - seen.q, share * self._dq_ref
+        a = share * ddq_ref + BANDWIDTH**2 * behind + 2.0 * BANDWIDTH * (ahead - seen.dq)
+        if share < 1.0:
+            a = a - (1.0 - share) * self._too_stiff(J[:3], seen.q, behind)
         torque = self.model.inverse_dynamics(seen.q, seen.dq, a) + self.model.friction_torque(seen.dq)
         if external.status == Status.ok:
+            # what the hand's push already bears is not taken off a second time
             self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (
-                external.torque - self._taken_off
+                external.torque + pushed - self._taken_off
             )
-        return torque - self._taken_off
+        found: Array = torque + share * (pushed - self._taken_off)
+        return found
+
+    def _too_stiff(self, J: Array, q: Array, behind: Array) -> Array:
+        """(n,) of the joints' acceleration, what the tip's stiffness above `stiffest` has in it [rad/s^2].
+
+        The tip's stiffness is that of the position control, its effective mass (O. Khatib, IEEE J. RA 3(1), 1987)
+        times the bandwidth squared; along its own axes it is cut.
+        """
+        yields = np.linalg.solve(self.model.mass_matrix(q), J.T)
+        mobility, axes = np.linalg.eigh(J @ yields)
+        stiffness = BANDWIDTH**2 / np.maximum(mobility, 1e-9)
+        force = axes @ (np.maximum(0.0, stiffness - self._stiffest) * (axes.T @ (J @ behind)))
+        surplus: Array = yields @ force
+        return surplus
 
     def touch(self) -> Touch:
         """Everything the pipeline knows after the newest sample."""
@@ -257,10 +348,18 @@ class InScene(ArmSlave):
         driver: in its scene.
         scene: what there is to touch; None: nothing.
         model: as it is known; None: exactly.
+        stiffest: see :class:`ArmSlave`.
     """
 
-    def __init__(self, driver: MujocoDriver, scene: Scene | None, *, model: Arm | None = None) -> None:
-        super().__init__(driver, model=model)
+    def __init__(
+        self,
+        driver: MujocoDriver,
+        scene: Scene | None,
+        *,
+        model: Arm | None = None,
+        stiffest: float = STIFFEST,
+    ) -> None:
+        super().__init__(driver, model=model, stiffest=stiffest)
         self._masses = list(() if scene is None else scene.masses)
         self._contact = np.zeros(6)
 
@@ -312,6 +411,7 @@ class SimulatedSlave(InScene):
         scene: what there is to touch; None: nothing.
         model: as it is known; None: exactly.
         seed: of the sensors' noise.
+        stiffest: see :class:`ArmSlave`.
 
     Raises:
         InputError: the pose does not fit.
@@ -319,14 +419,21 @@ class SimulatedSlave(InScene):
     """
 
     def __init__(
-        self, arm: Arm, q: Array, scene: Scene | None = None, *, model: Arm | None = None, seed: int = 0
+        self,
+        arm: Arm,
+        q: Array,
+        scene: Scene | None = None,
+        *,
+        model: Arm | None = None,
+        seed: int = 0,
+        stiffest: float = STIFFEST,
     ) -> None:
         if np.shape(q) != (arm.n,):
             raise InputError(f"q: expected {arm.n} angles, got {np.shape(q)}")
         build = None if scene is None else scene.build
         plant = Plant(arm, contacts=build is not None, scene=build, timestep=2.5e-4, integrator="discrete")
         driver = MujocoDriver(plant, sensor=SensorModel(arm, rate=RATE, seed=seed), q=q)
-        super().__init__(driver, scene, model=model)
+        super().__init__(driver, scene, model=model, stiffest=stiffest)
 
 
 def _of_arm(model: Any, geom: int) -> bool:

@@ -26,6 +26,12 @@ struct TankConfig {
 /// energy away, never make it. So together, whatever the network does,
 ///
 ///   given_M + given_S <= initial_M + initial_S + taken_M + taken_S     at every instant.
+///
+/// Each also tells how much of the other's sum it has booked, so what is on the way is known, and counts as the receiver's: a side that
+/// would come above `most` with it is given nothing. Without that the line itself would be a store as large as its delay, and energy taken
+/// long ago could feed a coupling that the delay makes unstable. So the whole store is bounded, whatever the delay:
+///
+///   level_M + level_S + on the way <= 2 most.
 class EnergyTank {
  public:
   explicit EnergyTank(const TankConfig& config = {}) : c_(config), level_(config.initial), lowest_(config.initial) {
@@ -54,11 +60,13 @@ class EnergyTank {
   void begin(double total) noexcept {
     if (std::isfinite(total)) booked_ = total;
   }
-  /// Give to the other side, whose level was `other` when it last told. dt [s]. Then throw away what is too much.
-  void give(double other, double dt) noexcept {
+  /// Give to the other side, whose level was `level` and which had booked `booked` of what was sent when it last told [J]. dt [s]. Then throw
+  /// away what is too much.
+  void give(double level, double booked, double dt) noexcept {
+    const double other = std::max(0.0, level) + std::max(0.0, sent_ - booked);
     const double surplus = std::max(0.0, level_ - c_.desired) * -std::expm1(-c_.surplus * dt);
-    const double share = std::max(0.0, level_ - std::max(0.0, other)) * -std::expm1(-c_.share * dt) * 0.5;
-    const double out = other < c_.most ? std::clamp(surplus + share, 0.0, std::max(0.0, level_)) : 0.0;
+    const double share = std::max(0.0, level_ - other) * -std::expm1(-c_.share * dt) * 0.5;
+    const double out = std::clamp(surplus + share, 0.0, std::max(0.0, std::min(level_, c_.most - other)));
     sent_ += out;
     level_ -= out;
     if (level_ > c_.most) {
@@ -76,6 +84,8 @@ class EnergyTank {
   double given() const noexcept { return given_; }
   double sent() const noexcept { return sent_; }
   double received() const noexcept { return received_; }
+  /// Of the other side's sum [J], to be told to it.
+  double booked() const noexcept { return booked_; }
   double dissipated() const noexcept { return dissipated_; }
   /// The least the level has been [J]; never below zero while the port is sampled well.
   double lowest() const noexcept { return lowest_; }

@@ -26,7 +26,7 @@ class Link {
   /// True if it is newer than everything before. An older session, an older number and broken numbers are left.
   bool receive(const Message& m, std::size_t n) noexcept {
     const bool sound = m.sequence > 0 && check::all_finite(m.position, n) && check::all_finite(m.velocity, n) && check::all_finite(m.force, n) &&
-                       std::isfinite(m.energy) && std::isfinite(m.level);
+                       std::isfinite(m.energy) && std::isfinite(m.booked) && std::isfinite(m.level);
     if (!sound || m.session < newest_.session || (m.session == newest_.session && m.sequence <= newest_.sequence)) return false;
     restarted_ = restarted_ || m.session != newest_.session;
     newest_ = m;

@@ -119,6 +119,9 @@ class MasterSide {
 
     std::uint16_t events = static_cast<std::uint16_t>(link_.events() | (bearable_ < 1.0 ? event_energy : 0));
     for (std::size_t i = 0; i < n_; ++i) {
+      // what fades, what holds and what returns may all change at once: their sum does not, even where the hand starts all at once
+      const double room = engaging && link_.alive() && good ? c_.resync_rate[i] * h : std::numeric_limits<double>::infinity();
+      out.force[i] = std::clamp(out.force[i], sent_[i] - room, sent_[i] + room);
       const double limited = std::clamp(out.force[i], -c_.force_limit[i], c_.force_limit[i]);
       if (limited != out.force[i]) events |= event_force;
       out.force[i] = good ? limited : 0.0;
@@ -130,7 +133,7 @@ class MasterSide {
         for (std::size_t i = 0; i < n_; ++i)
           if (out.force[i] * v_[i] + std::abs(out.force[i]) * slack[i] > 0.0) out.force[i] *= s_f;
       }
-      tank_.give(s.level, h);
+      tank_.give(s.level, s.booked, g * h);  // what comes back slowly does not empty its tank at once
     }
     if (!good) events |= event_input;
     sent_ = out.force;
@@ -146,6 +149,7 @@ class MasterSide {
     message_.velocity = v_;
     message_.force = check::all_finite(hand, n_) ? hand : JointVector{};
     message_.energy = tank_.sent();
+    message_.booked = tank_.booked();
     message_.level = tank_.level();
     message_.engaged = closed && good;
     return out;

@@ -15,6 +15,7 @@ struct Message {
   JointVector velocity{};       ///< [m/s] or [rad/s]
   JointVector force{};          ///< master: of the hand on the device; slave: of the environment, as it is to be felt [N] or [N m]
   double energy = 0.0;          ///< sent since the session began: it never falls, so loss and repetition do no harm [J]
+  double booked = 0.0;          ///< of what the other side has sent: the rest is still on its way [J]
   double level = 0.0;           ///< of the sender's tank [J]
   bool engaged = false;         ///< the sender wants to be coupled: the clutch is closed
 };

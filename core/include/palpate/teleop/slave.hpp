@@ -202,7 +202,7 @@ class SlaveSide {
       if (told[i] != whole) events |= event_force;
       out.felt[i] = told[i];
     }
-    if (c_.passive) tank_.give(m.level, h);
+    if (c_.passive) tank_.give(m.level, m.booked, g * h);
     if (!good) events |= event_input;
 
     out.position = reference_;
@@ -221,6 +221,7 @@ class SlaveSide {
     message_.velocity = good ? to_master(v, 1.0 / c_.motion_scale) : JointVector{};
     message_.force = to_master(told, c_.force_scale);
     message_.energy = tank_.sent();
+    message_.booked = tank_.booked();
     message_.level = tank_.level();
     message_.engaged = allowed && good;
     return out;
