@@ -25,7 +25,9 @@ MS = 1_000_000
 
 
 def message(sequence: int, session: int = 1, n: int = 3, value: float = 0.5) -> Message:
-    return Message(session, sequence, 0, np.full(n, value), np.zeros(n), np.full(n, -value), 0.1, 0.15, 0.2, True)
+    return Message(
+        session, sequence, 0, np.full(n, value), np.zeros(n), np.full(n, -value), 0.1, 0.15, 0.2, True
+    )
 
 
 class Two:

@@ -161,4 +161,5 @@ class GearedPlant(Plant):
 
     def motor_torque(self) -> Array:
         """(n,) of the motors at the link side in the last step [N m]."""
-        return np.linalg.solve(self.drives.B.T, self.torque)
+        found: Array = np.linalg.solve(self.drives.B.T, self.torque).astype(np.float64)
+        return found

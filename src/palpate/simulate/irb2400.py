@@ -12,6 +12,7 @@ from .. import robots
 from ..arm import Arm, Array
 from ..logs import Sample
 from .drives import Drives
+from .sensing import SensorModel
 
 B = np.eye(6)
 B[2, 1] = 1.0
@@ -121,42 +122,34 @@ class CurrentSensors:
         )
 
 
-class PhaseSensors:
+class PhaseSensors(SensorModel):
     """What is measured of the robot live: encoder counts, and as effort (6, 2) two phase currents per motor.
 
-    It takes the place of a :class:`palpate.simulate.SensorModel`.
-
     Args:
+        arm: the robot.
         sensors: the current sensors.
         rate: readings per second [Hz].
         seed: of the noise.
     """
 
-    def __init__(self, sensors: CurrentSensors, *, rate: float = 1000.0, seed: int = 0) -> None:
-        self.period_ns = round(1e9 / rate)
-        """time between readings [ns]"""
-        self.n = len(sensors.angle)
-        """motors"""
-        self._sensors, self._seed = sensors, seed
+    def __init__(self, arm: Arm, sensors: CurrentSensors, *, rate: float = 1000.0, seed: int = 0) -> None:
+        self._sensors = sensors
         self._pulse = np.append(glitch_pulse(rate), 0.0)
-        self.reset()
+        super().__init__(arm, rate=rate, seed=seed)
 
     def reset(self) -> None:
         """Back to the first reading."""
-        self._rng = np.random.default_rng(self._seed)
+        super().reset()
         self._way = np.zeros(self.n)
         self._age = np.full(self.n, len(self._pulse) - 1)
 
-    def drive(self, torque: npt.ArrayLike) -> Array:
-        """(n,) torque that is applied for one that was commanded [N m]: the drives are strong enough here."""
-        return np.array(torque, dtype=np.float64)
-
-    def read(self, time_ns: int, q: Array, dq: Array, torque: Array) -> Sample:
+    def read(self, time_ns: int, q: npt.ArrayLike, dq: npt.ArrayLike, torque: npt.ArrayLike) -> Sample:
         """The reading of an instant; arguments as of :meth:`palpate.simulate.SensorModel.read`."""
-        w = B @ dq
+        w = B @ np.asarray(dq)
         way = np.where(np.abs(w) > TURNING, np.sign(w), self._way)
         self._age = np.where(way * self._way < 0.0, 0, np.minimum(self._age + 1, len(self._pulse) - 1))
         self._way = way
-        motor = np.linalg.solve(B.T, torque)
-        phases = self._sensors.measured(motor, B @ q, self._pulse[self._age], self._rng)
-        return Sample(time_ns, np.round(q / ENCODER) * ENCODER, None, np.column_stack(phases))
+        motor: Array = np.linalg.solve(B.T, np.asarray(torque)).astype(np.float64)
+        position = np.asarray(q)
+        phases = self._sensors.measured(motor, B @ position, self._pulse[self._age], self._rng)
+        return Sample(time_ns, np.round(position / ENCODER) * ENCODER, None, np.column_stack(phases))

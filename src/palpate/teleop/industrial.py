@@ -56,7 +56,7 @@ class IndustrialSlave(InScene):
         self._inverse = np.linalg.inv(drives.B)
         self._gains = position_gains(drives, GearedPlant.seen_inertia(arm, drives, q))
         self._integral = np.zeros(arm.n)
-        sensors = PhaseSensors(CurrentSensors.drawn(np.random.default_rng(SENSORS)), seed=seed)
+        sensors = PhaseSensors(arm, CurrentSensors.drawn(np.random.default_rng(SENSORS)), seed=seed)
         plant = GearedPlant(arm, drives, q, contacts=build is not None, scene=build)
         self._certain = False
         self._estimator = MotorForce(arm, identified(arm.name), period=sensors.period_ns * 1e-9)

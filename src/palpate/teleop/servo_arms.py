@@ -269,6 +269,11 @@ class ServoSlave(InScene):
         found: Array = self.model.jacobian(self.plant.q)[:3].T @ super().true_force()
         return found
 
+    def at_tip(self, q: Array, torque: Array) -> Array:
+        """(3,) least force at the tool's tip that is such a torque of the joints (n,) [N]."""
+        found: Array = np.linalg.lstsq(self.model.jacobian(q)[:3].T, torque, rcond=None)[0].astype(np.float64)
+        return found
+
     def tip(self, q: Array) -> Array:
         """(3,) place of the tool's tip at a pose (n,) [m]."""
         return self._pose(q)[1]
