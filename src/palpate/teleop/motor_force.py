@@ -349,7 +349,7 @@ class MotorForce:
 
     def _of_load(self, q: Array, dq: Array) -> Array:
         """(n,) external torque of the mass that is held [N m]."""
-        J = self.arm.jacobian(q)[:3]
+        J = self.arm.jacobian(q, self.arm.grasp)[:3]
         v = J @ dq
         a = (v - self._v) / self._h
         self._v = v

@@ -340,7 +340,7 @@ def slave_arm(name: str) -> SlaveArm:
                 "6.5 mA",
             ),
             gain=40.0,
-            threshold=4.0,
+            threshold=5.0,
             masses=(0.1, 0.2),
             kind="servos",
         )

@@ -43,6 +43,8 @@ BUS_RATE = 250.0
 """readings and commands per second, what a bus of six servos at 1 Mbit/s allows [Hz]"""
 OBSERVER = 30.0
 """bandwidth of the follower's momentum observer [rad/s]"""
+CERTAIN, GONE = 64.0, 16.0
+"""a touch is certain where the sum of the joints' (torque/std)^2 is above the one, until it is below the other [1]"""
 TURNING = 0.05
 """speed from which on the sign of friction is known: the encoder has turned a few counts lately [rad/s]"""
 VELOCITY = 120.0
@@ -189,6 +191,7 @@ class ServoSlave(InScene):
             integrator="discrete",
         )
         self._coulomb = np.array([j.friction.coulomb for j in known.joints])
+        self._certain = False
         driver = MujocoDriver(plant, sensor=SensorModel(known, rate=BUS_RATE, seed=seed), q=q)
         self._every, self._tick = round(RATE / BUS_RATE), 0
         super().__init__(driver, scene, model=known)
@@ -225,17 +228,13 @@ class ServoSlave(InScene):
         lost = LOAD_FRICTION * load * np.tanh(dq / TURNING)
         torque = np.asarray(external.torque) + lost if good else np.zeros(self.axes)
         std = np.sqrt(np.square(external.std) + np.square(hidden) * (1.0 - known))
-        return Seen(
-            self._sample.time_ns,
-            q,
-            dq,
-            q,
-            dq,
-            torque,
-            std if good else np.full(self.axes, np.inf),
-            self._reason,
-            good and self._lost == 0,
-        )
+        surprise = float(np.square(torque / std).sum())
+        self._certain = good and surprise > (GONE if self._certain else CERTAIN)
+        std = std if good else np.full(self.axes, np.inf)
+        # that there is a touch is certain then, and the question is its size
+        shown = 0.25 * std if self._certain else std
+        usable = good and self._lost == 0
+        return Seen(self._sample.time_ns, q, dq, q, dq, torque, std, self._reason, usable, shown)
 
     def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:
         """Send the torque that takes the joints to `x_ref` (n,) [rad] at `v_ref` (n,) [rad/s].
@@ -266,12 +265,14 @@ class ServoSlave(InScene):
 
     def true_force(self) -> Array:
         """(n,) torque of the scene on the joints, from MuJoCo's contacts [N m]."""
-        found: Array = self.model.jacobian(self.plant.q)[:3].T @ super().true_force()
+        found: Array = self.model.jacobian(self.plant.q, self.model.grasp)[:3].T @ super().true_force()
         return found
 
     def at_tip(self, q: Array, torque: Array) -> Array:
         """(3,) least force at the tool's tip that is such a torque of the joints (n,) [N]."""
-        found: Array = np.linalg.lstsq(self.model.jacobian(q)[:3].T, torque, rcond=None)[0].astype(np.float64)
+        found: Array = np.linalg.lstsq(self.model.jacobian(q, self.model.grasp)[:3].T, torque, rcond=None)[
+            0
+        ].astype(np.float64)
         return found
 
     def tip(self, q: Array) -> Array:
@@ -291,7 +292,7 @@ def joint_path(
     for time in times:
         for _ in range(3):
             T = arm.forward_kinematics(now)
-            J = arm.jacobian(now)[:3]
+            J = arm.jacobian(now, arm.grasp)[:3]
             away = start + path(float(time)) - (T[:3, :3] @ arm.grasp + T[:3, 3])
             now = now + J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(3), away)
         rows.append(now - q)
