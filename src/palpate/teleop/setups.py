@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from .._core import LinkOptions, TankOptions
 from ..arm import Array
 from .channel import Faults
 from .coupling import CouplingName, MasterSide, SlaveSide
-from .masters import Hand, HapticDevice
+from .masters import Device, Hand, HapticDevice
 from .scenes import Scene, find, slave_arm
 from .session import Cut, Progress, Run, run
 from .slaves import STIFFEST, SimulatedSlave
@@ -115,47 +116,97 @@ def build(
         InputError: a name or a number is wrong.
         MissingExtraError: mujoco or cryptography is not installed.
     """
+    shared = Shared(coupling, passive)
+    slave, follower, place, assumed = build_slave(
+        scene,
+        arm=arm,
+        shared=shared,
+        stiffness=stiffness,
+        press=press,
+        masses=masses,
+        motion_scale=motion_scale,
+        force_scale=force_scale,
+        stiffest=stiffest,
+        seed=seed,
+    )
+    device = HapticDevice(hand or scripted(place, motion_scale))
+    return Setup(
+        scene=place,
+        device=device,
+        slave=slave,
+        master=build_master(device, shared),
+        follower=follower,
+        motion_scale=motion_scale,
+        seconds=10.0 if place is None else place.seconds,
+        assumed=assumed,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """What both sides must have alike."""
+
+    coupling: CouplingName = "force_position"
+    passive: bool = True
+    session: int | None = 1
+    """of both sides' runs; None: the time"""
+
+    def options(self) -> dict[str, Any]:
+        """For :class:`MasterSide` and :class:`SlaveSide`."""
+        return {
+            "coupling": self.coupling,
+            "passive": self.passive,
+            "session": self.session,
+            "tank": TankOptions(**TANK),
+            "link": LinkOptions(),
+        }
+
+
+def scripted(scene: Scene | None, motion_scale: float = 1.0) -> Hand:
+    """A hand that does what the scene asks for."""
+    path = None if scene is None else scene.path
+    return Hand() if path is None else Hand(wish=lambda t: np.asarray(path(t)) / motion_scale)
+
+
+def build_master(device: Device, shared: Shared) -> MasterSide:
+    """What the hand feels that holds a device."""
+    return MasterSide(3, device.force_limit, contact_damping=CONTACT_DAMPING, **shared.options())
+
+
+def build_slave(
+    scene: str | None,
+    *,
+    arm: str = "kuka_lbr_iiwa14",
+    shared: Shared,
+    stiffness: float = 2000.0,
+    press: float = 0.02,
+    masses: tuple[float, ...] = (0.5, 1.2),
+    motion_scale: float = 1.0,
+    force_scale: float | None = None,
+    stiffest: float = STIFFEST,
+    seed: int = 0,
+) -> tuple[SimulatedSlave, SlaveSide, Scene | None, tuple[str, ...]]:
+    """An arm in a scene, where it goes, the scene, and what is assumed of it; options of :func:`build`.
+
+    Raises:
+        InputError: a name or a number is wrong.
+        MissingExtraError: mujoco is not installed.
+    """
     chosen = slave_arm(arm)
     T = chosen.arm.forward_kinematics(chosen.q)
     tip: Array = T[:3, :3] @ chosen.arm.grasp + T[:3, 3]
     place = None if scene is None else find(scene, tip, stiffness=stiffness, press=press, masses=masses)
-    path = None if place is None else place.path
-    if hand is None:
-        hand = Hand() if path is None else Hand(wish=lambda t: np.asarray(path(t)) / motion_scale)
-    device = HapticDevice(hand)
-    tank, link = TankOptions(**TANK), LinkOptions()
-    scale = chosen.force_scale if force_scale is None else force_scale
-    return Setup(
-        scene=place,
-        device=device,
-        slave=SimulatedSlave(chosen.arm, chosen.q, place, seed=seed, stiffest=stiffest),
-        master=MasterSide(
-            3,
-            device.force_limit,
-            coupling=coupling,
-            contact_damping=CONTACT_DAMPING,
-            tank=tank,
-            link=link,
-            passive=passive,
-            session=1,
-        ),
-        follower=SlaveSide(
-            3,
-            0.5,
-            lower=tip - REACH,
-            upper=tip + REACH,
-            force_limit=100.0,
-            acceleration=ACCELERATION,
-            threshold=THRESHOLD,
-            coupling=coupling,
-            motion_scale=motion_scale,
-            force_scale=scale,
-            tank=tank,
-            link=link,
-            passive=passive,
-            session=1,
-        ),
+    slave = SimulatedSlave(chosen.arm, chosen.q, place, seed=seed, stiffest=stiffest)
+    side = SlaveSide(
+        3,
+        0.5,
+        lower=tip - REACH,
+        upper=tip + REACH,
+        force_limit=100.0,
+        acceleration=ACCELERATION,
+        threshold=THRESHOLD,
         motion_scale=motion_scale,
-        seconds=10.0 if place is None else place.seconds,
-        assumed=chosen.assumed,
+        force_scale=chosen.force_scale if force_scale is None else force_scale,
+        **shared.options(),
     )
+    return slave, side, place, chosen.assumed
