@@ -6,6 +6,7 @@ import math
 import sys
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -30,11 +31,15 @@ from ._common import (
 )
 from ._live import interruptible
 
+VIEW_S = 600.0
+"""how long a viewed run is where nobody says [s]"""
+
 if TYPE_CHECKING:
     from ..teleop import CouplingName, Faults, UdpChannel
     from ..teleop.ends import MasterEnd, SlaveEnd
     from ..teleop.masters import Device
-    from ..teleop.session import Cut
+    from ..teleop.session import Cut, Tap
+    from ..teleop.setups import Setup
 
 
 _Key = Annotated[
@@ -42,7 +47,9 @@ _Key = Annotated[
 ]
 _Coupling = Annotated[
     str,
-    typer.Option("--coupling", metavar="NAME", help="force_position (as published), position_position or four_channel."),
+    typer.Option(
+        "--coupling", metavar="NAME", help="force_position (as published), position_position or four_channel."
+    ),
 ]
 _Passivity = Annotated[
     bool,
@@ -51,7 +58,9 @@ _Passivity = Annotated[
 _Delay = Annotated[float, typer.Option("--delay", metavar="S", help="Of every message, each way.")]
 _Jitter = Annotated[
     float,
-    typer.Option("--jitter", metavar="S", help="Uniform, on top of the delay; messages overtake one another."),
+    typer.Option(
+        "--jitter", metavar="S", help="Uniform, on top of the delay; messages overtake one another."
+    ),
 ]
 _Loss = Annotated[float, typer.Option("--loss", metavar="P", help="Probability that a message is lost.")]
 _Duplicate = Annotated[
@@ -66,9 +75,12 @@ _Record = Annotated[
     typer.Option("--record", metavar="FILE", help="Record this side, on its own clock.", show_default=False),
 ]
 _Scene = Annotated[
-    str, typer.Argument(metavar="[SCENE]", help="wall, rigid, surface, peg, lift or free.", show_default=False)
+    str,
+    typer.Argument(metavar="[SCENE]", help="wall, rigid, surface, peg, lift or free.", show_default=False),
 ]
-_Arm = Annotated[str, typer.Option("--arm", metavar="ARM", help="The slave: kuka_lbr_iiwa14 or kuka_lbr_iiwa7.")]
+_Arm = Annotated[
+    str, typer.Option("--arm", metavar="ARM", help="The slave: kuka_lbr_iiwa14 or kuka_lbr_iiwa7.")
+]
 _Stiffness = Annotated[float, typer.Option("--stiffness", metavar="N/M", help="Of the wall.")]
 _MotionScale = Annotated[
     float, typer.Option("--motion-scale", metavar="S", help="Motion of the arm per motion of the hand.")
@@ -124,6 +136,7 @@ def add(app: typer.Typer) -> None:
             "palpate teleop run lift --mass 0.4 --mass 1.5",
             "palpate teleop run wall --cut 5@1.5",
             "palpate teleop run rigid --view",
+            "palpate teleop run rigid --view",
         ),
     )(run)
     verbs.command(
@@ -176,7 +189,9 @@ def key(
 def join(
     master: Annotated[Path, typer.Argument(metavar="MASTER", help="Recording of the master's side.")],
     slave: Annotated[Path, typer.Argument(metavar="SLAVE", help="And of the slave's.")],
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="What to write.")] = Path("teleop.mcap"),
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="What to write.")] = Path(
+        "teleop.mcap"
+    ),
     json: Json = False,
 ) -> int:
     """Join two recordings."""
@@ -233,13 +248,17 @@ def slave(
 
 
 def master(
-    connect: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where the slave listens.")] = "127.0.0.1:5005",
+    connect: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Where the slave listens.")
+    ] = "127.0.0.1:5005",
     key: _Key = Path("teleop.key"),
     device: Annotated[
-        str, typer.Option(metavar="NAME", help="hand (simulated, follows a script) or keys (of this terminal).")
+        str,
+        typer.Option(metavar="NAME", help="hand (simulated, follows a script) or keys (of this terminal)."),
     ] = "hand",
     script: Annotated[
-        str, typer.Option(metavar="SCENE", help="What the simulated hand does: wall, rigid, surface, peg, free.")
+        str,
+        typer.Option(metavar="SCENE", help="What the simulated hand does: wall, rigid, surface, peg, free."),
     ] = "wall",
     bind: Annotated[
         str | None,
@@ -394,6 +413,12 @@ def run(
     record: Annotated[
         bool, typer.Option("--record/--no-record", help="Write teleop.mcap, both sides in one log.")
     ] = True,
+    view: Annotated[
+        bool, typer.Option("--view", help="A live page: both arms, forces, and the network to be made worse.")
+    ] = False,
+    listen: Annotated[
+        str, typer.Option(metavar="[HOST:]PORT", help="Where the page is served; 0 takes any free port.")
+    ] = "127.0.0.1:8080",
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
@@ -422,9 +447,16 @@ def run(
         passive=passivity,
         seed=seed,
     )
-    with interruptible() as stopped, _Bar(silent=json or quiet) as bar:
-        result = setup.run(seconds=seconds, faults=faults, cuts=cuts, progress=bar, seed=seed, stop=stopped)
-        ended = stopped()
+    options: dict[str, Any] = {}
+    with ExitStack() as stack:
+        if view:
+            options["tap"], seconds = _page(setup, faults, listen, stack, seconds), seconds or VIEW_S
+        stopped = stack.enter_context(interruptible())
+        bar = stack.enter_context(_Bar(silent=json or quiet or view))
+        result = setup.run(
+            seconds=seconds, faults=faults, cuts=cuts, progress=bar, seed=seed, stop=stopped, **options
+        )
+        ended = stopped() and not view
     files: dict[str, str] = {}
     settings: dict[str, object] = {
         "scene": scene,
@@ -462,6 +494,21 @@ def run(
         head += list(files.items())
         print_rows(head, [f"at {t:.2f} s: {text}" for t, text in result.reasons])
     return STOPPED if ended else 0
+
+
+def _page(setup: Setup, faults: Faults | None, listen: str, stack: ExitStack, seconds: float | None) -> Tap:
+    """A live page of what runs, closed with the stack; its tap."""
+    from ..view.teleop import Person, TeleopPage
+    from .view import address
+
+    host, port = address(listen)
+    person = Person(setup.device.hand.wish, setup.seconds)
+    setup.device.hand = replace(setup.device.hand, wish=person)
+    page = TeleopPage(setup, person=person, faults=faults, host=host, port=port)
+    stack.callback(page.close)
+    say(f"{page.url}   Ctrl-C ends, and so do {seconds or VIEW_S:g} s")
+    sys.stdout.flush()
+    return page.tap
 
 
 def _cut(text: str) -> Cut:

@@ -48,7 +48,9 @@ class MasterEnd:
         self._hand = self._hand - math.expm1(-HAND * PERIOD) * (-command.force - self._hand)
         if not gone:
             self.device.step(command.force, PERIOD)
-        self.reason = gone or ("a reading of the device is not a number" if command.events & Event.INPUT else "")
+        self.reason = gone or (
+            "a reading of the device is not a number" if command.events & Event.INPUT else ""
+        )
         return command
 
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from .._core import __version__
 from ..errors import InputError
-from ..logs import Log, Recorder, Signal
 from ..logs import Event as LogEvent
+from ..logs import Log, Recorder, Signal
 from .channel import UdpChannel
 from .coupling import Event, MasterCommand, SlaveCommand, event_words
 from .ends import PERIOD, MasterEnd, SlaveEnd
@@ -206,7 +206,9 @@ def join(master: Log, slave: Log) -> Log:
     """
     for log, side in ((master, "master"), (slave, "slave")):
         if log.meta.get("what") != f"teleoperation: {side}":
-            raise InputError(f"not a recording of a {side}: its first message says {log.meta.get('what', 'nothing')!r}")
+            raise InputError(
+                f"not a recording of a {side}: its first message says {log.meta.get('what', 'nothing')!r}"
+            )
     known = master.signals.get("clock_offset")
     if known is None or not len(known):
         raise InputError("the master's recording knows no clock offset: the two sides never met")
