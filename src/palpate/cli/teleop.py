@@ -8,7 +8,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -367,7 +367,7 @@ def _coupling(name: str) -> CouplingName:
 
     if name not in COUPLINGS:
         raise InputError(f"--coupling: expected {', '.join(COUPLINGS)}, got {name!r}")
-    return cast("CouplingName", name)
+    return name
 
 
 def run(

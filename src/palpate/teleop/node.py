@@ -121,10 +121,9 @@ class Node:
         if isinstance(end, MasterEnd):
             out.sample(now, end.x, end.v, command.force)
             name = "master"
-        else:
-            seen = end.seen
+        elif isinstance(command, SlaveCommand):
+            name, seen = "slave", end.seen
             out.sample(now, seen.q, None, end.slave.driver.plant.torque)
-            name = "slave"
             for what, value, unit in (
                 ("slave_tip", seen.x, "m"),
                 ("slave_reference", command.position, "m"),

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..arm import Array
 from ..report._style import LIGHT
@@ -136,7 +137,7 @@ class TeleopPage:
             opacity=0.12,
         )
         self._handle = server.scene.add_icosphere("/device/handle", radius=0.02, color=(0, 114, 178))
-        server.scene.add_label("/device/name", "device", position=self._device + [0.0, 0.0, 0.34])
+        server.scene.add_label("/device/name", "device", position=self._device + np.array([0.0, 0.0, 0.34]))
         server.scene.add_label("/slave/name", "slave", position=(0.0, 0.0, 1.3))
         self._goal = server.scene.add_icosphere("/goal", radius=0.018, color=(0, 114, 178), opacity=0.35)
         self._boxes = self._touched()
@@ -150,8 +151,8 @@ class TeleopPage:
             )
             for name, colour in (("true", (30, 30, 30)), ("felt", (213, 94, 0)))
         }
-        server.initial_camera.position = tuple(float(x) for x in self._tip + [1.1, -1.7, 0.7])
-        server.initial_camera.look_at = tuple(float(x) for x in self._tip + 0.4 * _ASIDE - [0.15, 0.0, 0.05])
+        server.initial_camera.position = self._tip + np.array([1.1, -1.7, 0.7])
+        server.initial_camera.look_at = self._tip + 0.4 * _ASIDE - np.array([0.15, 0.0, 0.05])
 
     def _touched(self) -> list[tuple[int, Any]]:
         """Boxes of the scene, with their geoms."""
@@ -161,7 +162,7 @@ class TeleopPage:
             if plant.model.geom_type[geom] != _box_type() or name.startswith("arm:"):
                 continue
             r, g, b = (round(255 * float(c)) for c in plant.model.geom_rgba[geom][:3])
-            size = tuple(2.0 * float(s) for s in plant.model.geom_size[geom])
+            size = 2.0 * np.array(plant.model.geom_size[geom])
             found.append(
                 (geom, self._server.scene.add_box(f"/scene/{geom}", dimensions=size, color=(r, g, b)))
             )
@@ -217,8 +218,9 @@ class TeleopPage:
         def moved(_: Any) -> None:
             person.go(1e-3 * np.array([a.value for a in axes]) if own.value else None)
 
-        for handle in (own, *axes):
-            handle.on_update(moved)
+        own.on_update(moved)
+        for axis in axes:
+            axis.on_update(moved)
 
     def _plot(self, keys: tuple[tuple[str, str], ...], unit: str) -> Any:
         import viser.uplot as uplot
@@ -324,5 +326,5 @@ def _box_type() -> int:
     return int(mujoco().mjtGeom.mjGEOM_BOX)
 
 
-def _line(tail: Array, force: Array) -> Array:
-    return np.array([[tail, tail + _NEWTONS * force]])
+def _line(tail: Array, force: Array) -> npt.NDArray[np.float32]:
+    return np.array([[tail, tail + _NEWTONS * force]], dtype=np.float32)
