@@ -274,9 +274,3 @@ def test_wrong_input_is_one_line(
     assert main(["teleop", *arguments, "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
-
-
-def test_a_key_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["teleop", "--new-key", str(tmp_path / "k")]) == 0
-    assert "readable by you alone" in capsys.readouterr().out
-    assert main(["teleop", "--new-key", str(tmp_path / "k")]) == 2

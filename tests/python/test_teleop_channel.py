@@ -253,7 +253,8 @@ with UdpChannel(bytes(range(32)), "master", 3, peer=("127.0.0.1", port)) as chan
     end, count, heard = time.monotonic() + 60.0, 0, 0
     while heard < 50 and time.monotonic() < end:
         count += 1
-        channel.send(Message(channel.session, count, 0, np.full(3, count), np.zeros(3), np.zeros(3), 0.0, 0.0, 0.0, True))
+        nothing = np.zeros(3)
+        channel.send(Message(channel.session, count, 0, np.full(3, count), nothing, nothing, 0.0, 0.0, 0.0, True))
         heard += len(channel.receive())
         time.sleep(0.001)
 print(heard)
@@ -294,7 +295,8 @@ with UdpChannel(key, "slave", 3) as slave, UdpChannel(key, "master", 3, peer=sla
     while heard < 100 and time.monotonic() < end:
         count += 1
         for side in (master, slave):
-            side.send(Message(side.session, count, 0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0.0, 0.0, True))
+            nothing = np.zeros(3)
+            side.send(Message(side.session, count, 0, nothing, nothing, nothing, 0.0, 0.0, 0.0, True))
         heard += len(slave.receive())
         master.receive()
         time.sleep(0.001)

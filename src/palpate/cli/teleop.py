@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
+from typer.core import TyperGroup
 
 from ..errors import InputError
 from . import STOPPED
@@ -26,44 +31,359 @@ from ._common import (
 )
 from ._live import interruptible
 
+VIEW_S = 600.0
+"""how long a viewed run is where nobody says [s]"""
+
 if TYPE_CHECKING:
-    from ..teleop.session import Cut
+    from ..teleop import CouplingName, Faults, UdpChannel
+    from ..teleop.ends import MasterEnd, SlaveEnd
+    from ..teleop.masters import Device
+    from ..teleop.session import Cut, Tap
+    from ..teleop.setups import Setup
+
+
+_Key = Annotated[
+    Path, typer.Option("--key", metavar="FILE", help="The key that both sides share; see palpate teleop key.")
+]
+_Coupling = Annotated[
+    str,
+    typer.Option(
+        "--coupling", metavar="NAME", help="force_position (as published), position_position or four_channel."
+    ),
+]
+_Passivity = Annotated[
+    bool,
+    typer.Option("--passivity/--no-passivity", help="The passivity layer; without it see what delay does."),
+]
+_Delay = Annotated[float, typer.Option("--delay", metavar="S", help="Of every message, each way.")]
+_Jitter = Annotated[
+    float,
+    typer.Option(
+        "--jitter", metavar="S", help="Uniform, on top of the delay; messages overtake one another."
+    ),
+]
+_Loss = Annotated[float, typer.Option("--loss", metavar="P", help="Probability that a message is lost.")]
+_Duplicate = Annotated[
+    float, typer.Option("--duplicate", metavar="P", help="Probability that a message comes twice.")
+]
+_Seconds = Annotated[
+    float | None,
+    typer.Option("--seconds", metavar="S", help="How long. [default: until Ctrl-C]", show_default=False),
+]
+_Record = Annotated[
+    Path | None,
+    typer.Option("--record", metavar="FILE", help="Record this side, on its own clock.", show_default=False),
+]
+_Scene = Annotated[
+    str,
+    typer.Argument(metavar="[SCENE]", help="wall, rigid, surface, peg, lift or free.", show_default=False),
+]
+_Arm = Annotated[
+    str,
+    typer.Option(
+        "--arm", metavar="ARM", help="The slave: kuka_lbr_iiwa14, kuka_lbr_iiwa7, abb_irb2400_16 or so101."
+    ),
+]
+_Stiffness = Annotated[float, typer.Option("--stiffness", metavar="N/M", help="Of the wall.")]
+_MotionScale = Annotated[
+    float | None,
+    typer.Option(
+        "--motion-scale",
+        metavar="S",
+        help="Motion of the arm per motion of the hand. [default: what suits the arm]",
+        show_default=False,
+    ),
+]
+_ForceScale = Annotated[
+    float | None,
+    typer.Option(
+        "--force-scale",
+        metavar="S",
+        help="Force felt per force touched. [default: what suits the arm]",
+        show_default=False,
+    ),
+]
+
+
+class _Verbs(TyperGroup):
+    """What is no verb is a scene: `palpate teleop wall` is `palpate teleop run wall`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args or (args[0] not in self.commands and args[0] not in ("--help", "-h")):
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
 
 
 def add(app: typer.Typer) -> None:
-    """Make the verb known."""
-    app.command(
-        "teleop",
+    """Make the verbs known."""
+    verbs = typer.Typer(
+        cls=_Verbs,
+        rich_markup_mode=None,
         help="Teleoperate a simulated arm and feel what it touches, without a force sensor.\n\n"
-        "A scripted hand holds a simulated haptic device; the arm follows it in MuJoCo. Scenes: wall (press "
-        "a spring of known stiffness), "
-        "surface (trace it), peg (into a hole), lift (objects whose masses nobody knows), free (nothing to touch). "
-        "Delay, jitter, loss and dead links come from a fault layer; every message is encrypted and authenticated.",
+        "Without a verb both sides run in this process: a scripted hand holds a simulated haptic device, the arm "
+        "follows it in MuJoCo; see palpate teleop run. With master and slave they are two processes, here or on two "
+        "machines.",
         epilog=examples(
             "palpate teleop",
             "palpate teleop wall --stiffness 5000 --delay 0.1 --jitter 0.05 --loss 0.2",
-            "palpate teleop wall --delay 0.1 --no-passivity",
-            "palpate teleop lift --mass 0.4 --mass 1.5",
-            "palpate teleop wall --cut 5@1.5",
-            "palpate teleop --new-key teleop.key",
+            "palpate teleop key teleop.key",
+            "palpate teleop slave wall --key teleop.key --record slave.mcap",
+            "palpate teleop master --connect 127.0.0.1:5005 --key teleop.key --record master.mcap",
+            "palpate teleop join master.mcap slave.mcap --out teleop.mcap",
+        ),
+    )
+    verbs.command(
+        "run",
+        help="Both sides in one process.\n\n"
+        "Scenes: wall (press a spring of known stiffness), rigid (a wall that gives no way), "
+        "surface (trace it), peg (into a hole), lift (objects whose masses nobody knows), free (nothing to touch). "
+        "Delay, jitter, loss and dead links come from a fault layer; every message is encrypted and authenticated.",
+        epilog=examples(
+            "palpate teleop run",
+            "palpate teleop run wall --stiffness 5000 --delay 0.1 --jitter 0.05 --loss 0.2",
+            "palpate teleop run wall --delay 0.1 --no-passivity",
+            "palpate teleop run lift --mass 0.4 --mass 1.5",
+            "palpate teleop run wall --cut 5@1.5",
+            "palpate teleop run rigid --view",
+            "palpate teleop run rigid --view",
         ),
     )(run)
+    verbs.command(
+        "slave",
+        help="The arm's side, a process of its own: a simulated arm in a scene waits for its master.\n\n"
+        "It listens on this machine alone unless --bind says otherwise, and takes nothing that was not sealed with "
+        "the key. What holds it is said here, to the master and in the recording.",
+        epilog=examples(
+            "palpate teleop slave wall --key teleop.key",
+            "palpate teleop slave peg --bind 0.0.0.0:5005 --key teleop.key --record slave.mcap",
+        ),
+    )(slave)
+    verbs.command(
+        "master",
+        help="The hand's side, a process of its own.\n\n"
+        "The device is a simulated one in a hand that follows a scene's script, or the keys of this terminal "
+        "(w a s d, q and e), which move and feel nothing.",
+        epilog=examples(
+            "palpate teleop master --connect 127.0.0.1:5005 --key teleop.key",
+            "palpate teleop master --connect 192.168.1.20:5005 --key teleop.key --device keys --record master.mcap",
+        ),
+    )(master)
+    verbs.command(
+        "key",
+        help="Write a new key, readable by you alone; copy it to the other machine by a safe way.",
+        epilog=examples("palpate teleop key teleop.key"),
+    )(key)
+    verbs.command(
+        "join",
+        help="Make one recording of both sides' on the master's clock.",
+        epilog=examples("palpate teleop join master.mcap slave.mcap --out teleop.mcap"),
+    )(join)
+    app.add_typer(verbs, name="teleop")
+
+
+def key(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Not there yet: a key is never overwritten.")],
+    json: Json = False,
+) -> int:
+    """Make a key."""
+    from ..teleop import make_key
+
+    path = make_key(file)
+    emit({"key": str(path)}) if json else say(
+        f"{path}: a new key, readable by you alone; both machines need the same"
+    )
+    return 0
+
+
+def join(
+    master: Annotated[Path, typer.Argument(metavar="MASTER", help="Recording of the master's side.")],
+    slave: Annotated[Path, typer.Argument(metavar="SLAVE", help="And of the slave's.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FILE", help="What to write.")] = Path(
+        "teleop.mcap"
+    ),
+    json: Json = False,
+) -> int:
+    """Join two recordings."""
+    from ..teleop.node import join_files
+
+    check_target(out, is_recording, "the recording")
+    path = join_files(master, slave, out)
+    emit({"log": str(path)}) if json else say(str(path))
+    return 0
+
+
+def slave(
+    scene: _Scene = "wall",
+    key: _Key = Path("teleop.key"),
+    bind: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Where to listen; port 0 takes any free one.")
+    ] = "127.0.0.1:5005",
+    arm: _Arm = "kuka_lbr_iiwa14",
+    coupling: _Coupling = "force_position",
+    stiffness: _Stiffness = 2000.0,
+    motion_scale: _MotionScale = None,
+    force_scale: _ForceScale = None,
+    passivity: _Passivity = True,
+    delay: _Delay = 0.0,
+    jitter: _Jitter = 0.0,
+    loss: _Loss = 0.0,
+    duplicate: _Duplicate = 0.0,
+    seconds: _Seconds = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Of noise and faults.")] = 0,
+    record: _Record = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Be the slave."""
+    from ..teleop import UdpChannel, read_key
+    from ..teleop.ends import SlaveEnd
+    from ..teleop.setups import Shared, build_slave
+
+    if scene == "lift":
+        raise InputError("the objects of lift come by a script of both sides: palpate teleop run lift")
+    faults = _faults(delay, jitter, loss, duplicate)
+    channel = UdpChannel(read_key(key), "slave", 3, local=_address("--bind", bind), faults=faults, seed=seed)
+    shared = Shared(_coupling(coupling), passivity, session=None)
+    follower, side, _, _ = build_slave(
+        None if scene == "free" else scene,
+        arm=arm,
+        shared=shared,
+        stiffness=stiffness,
+        motion_scale=motion_scale,
+        force_scale=force_scale,
+        seed=seed,
+    )
+    return _serve(SlaveEnd(follower, side), channel, record, seconds, json=json, quiet=quiet)
+
+
+def master(
+    connect: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Where the slave listens.")
+    ] = "127.0.0.1:5005",
+    key: _Key = Path("teleop.key"),
+    device: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="hand (simulated, follows a script) or keys (of this terminal)."),
+    ] = "hand",
+    script: Annotated[
+        str,
+        typer.Option(metavar="SCENE", help="What the simulated hand does: wall, rigid, surface, peg, free."),
+    ] = "wall",
+    bind: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Where to listen for the answers. [default: this machine alone for a slave here, else all]",
+            show_default=False,
+        ),
+    ] = None,
+    coupling: _Coupling = "force_position",
+    passivity: _Passivity = True,
+    delay: _Delay = 0.0,
+    jitter: _Jitter = 0.0,
+    loss: _Loss = 0.0,
+    duplicate: _Duplicate = 0.0,
+    seconds: _Seconds = None,
+    seed: Annotated[int, typer.Option(metavar="N", help="Of faults.")] = 0,
+    record: _Record = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> int:
+    """Be the master."""
+    from ..teleop import HapticDevice, Keys, UdpChannel, read_key
+    from ..teleop.ends import MasterEnd
+    from ..teleop.masters import TerminalKeys
+    from ..teleop.scenes import find
+    from ..teleop.setups import Shared, build_master, scripted
+
+    if device not in ("hand", "keys"):
+        raise InputError(f"--device: expected hand or keys, got {device!r}")
+    peer = _address("--connect", connect)
+    here = peer[0] in ("127.0.0.1", "localhost")
+    local = _address("--bind", bind) if bind is not None else ("127.0.0.1" if here else "0.0.0.0", 0)
+    faults = _faults(delay, jitter, loss, duplicate)
+    channel = UdpChannel(read_key(key), "master", 3, local=local, peer=peer, faults=faults, seed=seed)
+    shared = Shared(_coupling(coupling), passivity, session=None)
+    with ExitStack() as stack:
+        held: Device
+        if device == "keys":
+            held = stack.enter_context(TerminalKeys(Keys()))
+        else:
+            held = HapticDevice(scripted(None if script == "free" else find(script, np.zeros(3))))
+        end = MasterEnd(held, build_master(held, shared))
+        return _serve(end, channel, record, seconds, json=json, quiet=quiet)
+
+
+def _serve(
+    end: MasterEnd | SlaveEnd,
+    channel: UdpChannel,
+    record: Path | None,
+    seconds: float | None,
+    *,
+    json: bool,
+    quiet: bool,
+) -> int:
+    """Run one side until Ctrl-C or the end; a line per second, and one whenever something holds it."""
+    from ..teleop.node import Node
+
+    if record is not None:
+        check_target(record, is_recording, "the recording")
+    role, (host, port) = channel.sealer.role, channel.address
+
+    def line(text: str) -> None:
+        if not (json or quiet):
+            say(text)
+            sys.stdout.flush()
+
+    if json:
+        emit({"role": role, "host": host, "port": port})
+    else:
+        say(f"{role} at {host}:{port}   Ctrl-C ends")
+    sys.stdout.flush()
+    node = Node(end, channel, record=record, tell=lambda reason: line(f"! {reason or 'free again'}"))
+    try:
+        with interruptible() as stopped:
+            node.run(
+                stopped,
+                seconds=math.inf if seconds is None else seconds,
+                show=lambda state: line(str(state)),
+            )
+            ended = stopped() and seconds is not None
+    finally:
+        node.close()
+    state = node.state()
+    if json:
+        emit({"gain": state.gain, "reason": state.reason, "refused": dict(state.refused), "loss": state.loss})
+    return STOPPED if ended else 0
+
+
+def _address(option: str, text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise InputError(f"{option}: expected HOST:PORT such as 127.0.0.1:5005, got {text!r}")
+    return host, int(port)
+
+
+def _faults(delay: float, jitter: float, loss: float, duplicate: float) -> Faults | None:
+    from ..teleop.channel import Faults
+
+    found = Faults(delay=delay, jitter=jitter, loss=loss, duplicate=duplicate)
+    return None if found == Faults() else found
+
+
+def _coupling(name: str) -> CouplingName:
+    from ..teleop.coupling import COUPLINGS
+
+    if name not in COUPLINGS:
+        raise InputError(f"--coupling: expected {', '.join(COUPLINGS)}, got {name!r}")
+    return name
 
 
 def run(
-    scene: Annotated[
-        str, typer.Argument(metavar="[SCENE]", help="wall, surface, peg, lift or free.", show_default=False)
-    ] = "wall",
-    arm: Annotated[
-        str, typer.Option(metavar="ARM", help="The slave: kuka_lbr_iiwa14, kuka_lbr_iiwa7 or abb_irb2400_16.")
-    ] = "kuka_lbr_iiwa14",
-    coupling: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME", help="force_position (as published), position_position or four_channel."
-        ),
-    ] = "force_position",
-    stiffness: Annotated[float, typer.Option(metavar="N/M", help="Of the wall.")] = 2000.0,
+    scene: _Scene = "wall",
+    arm: _Arm = "kuka_lbr_iiwa14",
+    coupling: _Coupling = "force_position",
+    stiffness: _Stiffness = 2000.0,
     press: Annotated[
         float, typer.Option(metavar="M", help="How far behind wall or surface the hand goes.")
     ] = 0.02,
@@ -75,30 +395,12 @@ def run(
             show_default=False,
         ),
     ] = None,
-    motion_scale: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S",
-            help="Motion of the arm per motion of the hand. [default: what suits the arm]",
-            show_default=False,
-        ),
-    ] = None,
-    force_scale: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S",
-            help="Force felt per force touched. [default: what suits the arm]",
-            show_default=False,
-        ),
-    ] = None,
-    delay: Annotated[float, typer.Option(metavar="S", help="Of every message, each way.")] = 0.0,
-    jitter: Annotated[
-        float, typer.Option(metavar="S", help="Uniform, on top of the delay; messages overtake one another.")
-    ] = 0.0,
-    loss: Annotated[float, typer.Option(metavar="P", help="Probability that a message is lost.")] = 0.0,
-    duplicate: Annotated[
-        float, typer.Option(metavar="P", help="Probability that a message comes twice.")
-    ] = 0.0,
+    motion_scale: _MotionScale = None,
+    force_scale: _ForceScale = None,
+    delay: _Delay = 0.0,
+    jitter: _Jitter = 0.0,
+    loss: _Loss = 0.0,
+    duplicate: _Duplicate = 0.0,
     cut: Annotated[
         list[str] | None,
         typer.Option(
@@ -107,12 +409,7 @@ def run(
             show_default=False,
         ),
     ] = None,
-    passivity: Annotated[
-        bool,
-        typer.Option(
-            "--passivity/--no-passivity", help="The passivity layer; without it see what delay does."
-        ),
-    ] = True,
+    passivity: _Passivity = True,
     seconds: Annotated[
         float | None,
         typer.Option(metavar="S", help="How long. [default: as long as the scene takes]", show_default=False),
@@ -125,35 +422,22 @@ def run(
     record: Annotated[
         bool, typer.Option("--record/--no-record", help="Write teleop.mcap, both sides in one log.")
     ] = True,
-    new_key: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Write a new key for the channel between two machines, and stop.",
-            show_default=False,
-        ),
-    ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="A live page: both arms, forces, and the network to be made worse.")
+    ] = False,
+    listen: Annotated[
+        str, typer.Option(metavar="[HOST:]PORT", help="Where the page is served; 0 takes any free port.")
+    ] = "127.0.0.1:8080",
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
     """Teleoperate."""
-    if new_key is not None:
-        from ..teleop import make_key
-
-        path = make_key(new_key)
-        emit({"key": str(path)}) if json else say(
-            f"{path}: a new key, readable by you alone; both machines need the same"
-        )
-        return 0
-    from ..teleop.channel import Faults
-    from ..teleop.coupling import COUPLINGS
     from ..teleop.record import record as write_log
     from ..teleop.record import rows, write_report
     from ..teleop.setups import build
 
-    if coupling not in COUPLINGS:
-        raise InputError(f"--coupling: expected {', '.join(COUPLINGS)}, got {coupling!r}")
-    faults = Faults(delay=delay, jitter=jitter, loss=loss, duplicate=duplicate)
+    chosen = _coupling(coupling)
+    faults = _faults(delay, jitter, loss, duplicate)
     cuts = tuple(map(_cut, cut or ()))
     page, log = out / "report.html", out / "teleop.mcap"
     if report or record:
@@ -163,7 +447,7 @@ def run(
     setup = build(
         None if scene == "free" else scene,
         arm=arm,
-        coupling=coupling,
+        coupling=chosen,
         stiffness=stiffness,
         press=press,
         masses=tuple(mass) if mass else None,
@@ -172,9 +456,16 @@ def run(
         passive=passivity,
         seed=seed,
     )
-    with interruptible() as stopped, _Bar(silent=json or quiet) as bar:
-        result = setup.run(seconds=seconds, faults=faults, cuts=cuts, progress=bar, seed=seed, stop=stopped)
-        ended = stopped()
+    options: dict[str, Any] = {}
+    with ExitStack() as stack:
+        if view:
+            options["tap"], seconds = _page(setup, faults, listen, stack, seconds), seconds or VIEW_S
+        stopped = stack.enter_context(interruptible())
+        bar = stack.enter_context(_Bar(silent=json or quiet or view))
+        result = setup.run(
+            seconds=seconds, faults=faults, cuts=cuts, progress=bar, seed=seed, stop=stopped, **options
+        )
+        ended = stopped() and not view
     files: dict[str, str] = {}
     settings: dict[str, object] = {
         "scene": scene,
@@ -212,6 +503,25 @@ def run(
         head += list(files.items())
         print_rows(head, [f"at {t:.2f} s: {text}" for t, text in result.reasons])
     return STOPPED if ended else 0
+
+
+def _page(setup: Setup, faults: Faults | None, listen: str, stack: ExitStack, seconds: float | None) -> Tap:
+    """A live page of what runs, closed with the stack; its tap."""
+    from ..teleop.masters import HapticDevice
+    from ..view.teleop import Person, TeleopPage
+    from .view import address
+
+    host, port = address(listen)
+    device = setup.device
+    if not isinstance(device, HapticDevice):
+        raise InputError("--view shows a haptic device and its arm; a leader arm and its twin have no page")
+    person = Person(device.hand.wish, setup.seconds)
+    device.hand = replace(device.hand, wish=person)
+    page = TeleopPage(setup, person=person, faults=faults, host=host, port=port)
+    stack.callback(page.close)
+    say(f"{page.url}   Ctrl-C ends, and so do {seconds or VIEW_S:g} s")
+    sys.stdout.flush()
+    return page.tap
 
 
 def _cut(text: str) -> Cut:

@@ -3,7 +3,8 @@
 A packet is a header in the clear and a body sealed with ChaCha20-Poly1305 (RFC 8439), whose tag covers both::
 
     "PT"  version u8  role u8 | salt 8 bytes | session u64 | sequence u64 | sealed body | tag 16 bytes
-    body: echo 8 bytes | time i64 | echo_time i64 | echo_age i64 | n u8 | flags u8 | energy, booked, level f64 | 3 n f64 | reason
+    body: echo 8 bytes | time i64 | echo_time i64 | echo_age i64 | n u8 | flags u8 | energy, booked, level f64
+          | 3 n f64 | reason
 
 The key of a direction in a run is HKDF-SHA256(shared key, salt, role), so a sequence number, which is the nonce,
 never meets a key
@@ -263,7 +264,7 @@ class Sealer:
             )
         if len(body) < _BODY.size:
             return self._refused("length", f"a body of {len(body)} bytes")
-        echo, sent_ns, echo_time, echo_age, n, flags, *energies = _BODY.unpack(body[: _BODY.size])
+        echo, sent_ns, echo_time, echo_age, n, flags, energy, booked, level = _BODY.unpack(body[: _BODY.size])
         end = _BODY.size + 24 * n
         if n != self.n or not end <= len(body) <= end + _MOST_WORDS:
             return self._refused("axes", f"the other side has {n} axes, this one {self.n}")
@@ -293,7 +294,7 @@ class Sealer:
                 f"{MAX_CLOCK_OFFSET:g} s are allowed",
             )
         values = np.frombuffer(body[:end], dtype=">f8", offset=_BODY.size).astype(np.float64)
-        if not (np.isfinite(values).all() and all(map(math.isfinite, energies))):
+        if not (np.isfinite(values).all() and all(map(math.isfinite, (energy, booked, level)))):
             return self._refused("not finite", "a number is not finite")
         return Message(
             session,
@@ -302,9 +303,11 @@ class Sealer:
             values[:n],
             values[n : 2 * n],
             values[2 * n :],
-            *energies,
-            engaged=bool(flags & 1),
-            reason="".join(c for c in body[end:].decode(errors="ignore") if c.isprintable()),
+            energy,
+            booked,
+            level,
+            bool(flags & 1),
+            "".join(c for c in body[end:].decode(errors="ignore") if c.isprintable()),
         )
 
     def _cipher(self, salt: bytes) -> Any:

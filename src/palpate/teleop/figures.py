@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .coupling import Event
-from .session import PERIOD, Cut, Run
+from .ends import PERIOD
+from .session import Cut, Run
 
 SETTLED = 2.0
 """the coupling is whole and the tare taken from here on [s]"""

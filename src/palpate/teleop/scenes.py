@@ -283,6 +283,7 @@ class SlaveArm:
         arm: with the tool as a shape, its grasp point at the centre of the tool's tip.
         q: (n,) pose at the start [rad].
         force_scale: force felt per force of the environment, so that the device's range fits the arm's [1].
+        speed: of its reference at most [m/s].
         threshold: of what is felt, in standard deviations [1]: at 1 kHz three are passed every third of a second.
         gain: with which the reference closes on the master's place [1/s].
         motion_scale: motion of the arm per motion of the hand [1].
@@ -297,6 +298,7 @@ class SlaveArm:
     q: Array
     force_scale: float
     assumed: tuple[str, ...]
+    speed: float = 0.5
     threshold: float = 5.0
     gain: float = 60.0
     motion_scale: float = 1.0
@@ -353,6 +355,7 @@ def slave_arm(name: str) -> SlaveArm:
                 "torque constants, gears, rotors, presliding, ripple and the errors of the current sensors of the ABB: "
                 "no source states them; they are those of the sensorless-force study",
             ),
+            speed=0.8,
             threshold=3.0,
             gain=20.0,
             motion_scale=2.0,

@@ -24,6 +24,22 @@ Progress: TypeAlias = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
+class Wish:
+    """What somebody who watches wants of the next period."""
+
+    faults: Faults
+    """of the network, each way"""
+    cut: bool = False
+    """the link is dead"""
+    closed: bool = True
+    """the clutch"""
+
+
+Tap: TypeAlias = "Callable[[int, Run], Wish]"
+"""told the period and the run as far as it is"""
+
+
+@dataclass(frozen=True, slots=True)
 class Cut:
     """The link dies for a while."""
 
@@ -54,6 +70,7 @@ class Run:
         q: (N, n) of the slave's joints [rad].
         effort: (N, n) as the driver gave it.
         reasons: (time [s], text): what held or slowed down, when it began.
+        holding: the newest of them still does.
         offset, round_trip: of the slave's clock against the master's [s]; 0 for one clock.
         bandwidth: (2,) from master to slave and back [bit/s].
         refused: packets not taken, by reason.
@@ -79,6 +96,7 @@ class Run:
     q: Array
     effort: Array
     reasons: list[tuple[float, str]] = field(default_factory=list)
+    holding: bool = False
     offset: float = math.nan
     round_trip: float = math.nan
     bandwidth: tuple[float, float] = (0.0, 0.0)
@@ -136,6 +154,7 @@ def run(
     weigh: bool = False,
     progress: Progress | None = None,
     stop: Callable[[], bool] = lambda: False,
+    tap: Tap | None = None,
     seed: int = 0,
 ) -> Run:
     """Run both sides in lock-step over a line with faults; every message goes through the encrypted packets of the
@@ -154,6 +173,7 @@ def run(
         weigh: weigh what is lifted.
         progress: told how far it is.
         stop: asked now and then; True ends the run there.
+        tap: called at the end of every period; what it wants is done in the next one.
         seed: of the faults and the packets' salts.
 
     Raises:
@@ -169,20 +189,21 @@ def run(
         "master": Sealer(key, "master", 1, slave.axes, salt=rng.bytes(8)),
         "slave": Sealer(key, "slave", 1, slave.axes, salt=rng.bytes(8)),
     }
-    there, back = (FaultyLine(faults or Faults(), seed + k) for k in range(2))
+    there, back = (FaultyLine(seed=seed + k) for k in range(2))
     sent = [0, 0]
     start = slave.x.copy()
     master, follower = MasterEnd(device, master_side), SlaveEnd(slave, slave_side)
-    reason, heard = "", False
+    reason, heard, wish = "", False, Wish(faults or Faults())
     picked: float | None = None
     picked_at = 0.0
     for k in range(count):
         time, now = k * PERIOD, k * 1_000_000
-        there.cut = back.cut = any(c.at <= time < c.at + c.seconds for c in cuts)
+        there.cut = back.cut = wish.cut or any(c.at <= time < c.at + c.seconds for c in cuts)
+        there.faults = back.faults = wish.faults
         for packet in back.receive(now):
             if (answer := boxes["master"].open(packet, now)) is not None:
                 master_side.receive(answer)
-        master.closed = closed(time)
+        master.closed = closed(time) and wish.closed
         command = master.step(now)
         packet = boxes["master"].seal(master_side.message(), now)
         sent[0] += len(packet) + 28
@@ -225,8 +246,11 @@ def run(
         now_reason = "the link is dead: both hold" if heard and silent else now_reason
         if now_reason != reason:
             reason = now_reason
+            out.holding = bool(reason)
             if reason:
                 out.reasons.append((time, reason))
+        if tap is not None:
+            wish = tap(k, out)
         if k % 200 == 199:
             if progress is not None:
                 progress(time + PERIOD, seconds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,8 +27,6 @@ ACCELERATION = 10.0
 """of the slave's reference at most [m/s^2]: twice what a hand does, and what the arm's joints can follow"""
 JOINT_HAND = {"mass": 0.03, "stiffness": 25.0, "damping": 1.2, "tremor": 0.01}
 """a :class:`Hand` of 0.5 kg, 400 N/m at a lever of a quarter metre [kg m^2, N m/rad, N m s/rad, N m]"""
-SPEED = 0.8
-"""of the slave's reference at most [m/s]"""
 REACH = 0.3
 """of the workspace to each side of the start [m]"""
 
@@ -120,118 +119,158 @@ def build(
         MissingExtraError: mujoco or cryptography is not installed.
     """
     chosen = slave_arm(arm)
-    T = chosen.arm.forward_kinematics(chosen.q)
-    tip: Array = T[:3, :3] @ chosen.arm.grasp + T[:3, 3]
     motion_scale = chosen.motion_scale if motion_scale is None else motion_scale
-    lifted = chosen.masses if masses is None else masses
-    place = None if scene is None else find(scene, tip, stiffness=stiffness, press=press, masses=lifted)
-    path = None if place is None else place.path
+    shared = Shared(coupling, passive)
+    slave, follower, place, assumed = build_slave(
+        scene,
+        arm=arm,
+        shared=shared,
+        stiffness=stiffness,
+        press=press,
+        masses=masses,
+        motion_scale=motion_scale,
+        force_scale=force_scale,
+        stiffest=stiffest,
+        seed=seed,
+    )
+    device: Device
     if chosen.kind == "servos":
-        return _joint_to_joint(chosen, place, coupling, hand, passive, seed)
-    if hand is None:
-        hand = Hand() if path is None else Hand(wish=lambda t: np.asarray(path(t)) / motion_scale)
-    device = HapticDevice(hand)
-    tank, link = TankOptions(**TANK), LinkOptions()
-    scale = chosen.force_scale if force_scale is None else force_scale
+        device = SimulatedLeader(chosen.arm, chosen.q, hand or scripted_joints(place, chosen), seed=seed + 1)
+        motion_scale = 1.0
+        master = _leading(chosen.arm.n, device, shared)
+    else:
+        device = HapticDevice(hand or scripted(place, motion_scale))
+        master = build_master(device, shared)
     return Setup(
         scene=place,
         device=device,
-        slave=(
-            IndustrialSlave(chosen.arm, chosen.q, place, seed=seed)
-            if chosen.kind == "phase_currents"
-            else SimulatedSlave(chosen.arm, chosen.q, place, seed=seed, stiffest=stiffest)
-        ),
-        master=MasterSide(
-            3,
-            device.force_limit,
-            coupling=coupling,
-            contact_damping=CONTACT_DAMPING,
-            tank=tank,
-            link=link,
-            passive=passive,
-            session=1,
-        ),
-        follower=SlaveSide(
-            3,
-            SPEED,
-            lower=tip - REACH,
-            upper=tip + REACH,
-            force_limit=chosen.force_limit,
-            acceleration=ACCELERATION,
-            threshold=chosen.threshold,
-            coupling=coupling,
-            gain=chosen.gain,
-            motion_scale=motion_scale,
-            force_scale=scale,
-            tank=tank,
-            link=link,
-            passive=passive,
-            session=1,
-        ),
+        slave=slave,
+        master=master,
+        follower=follower,
         motion_scale=motion_scale,
         seconds=10.0 if place is None else place.seconds,
-        assumed=chosen.assumed,
+        assumed=assumed,
     )
 
 
-def _joint_to_joint(
-    chosen: SlaveArm,
-    place: Scene | None,
-    coupling: CouplingName,
-    hand: Hand | None,
-    passive: bool,
-    seed: int,
-) -> Setup:
-    """A leader arm in a hand and its twin in a scene; `hand` is at the joints."""
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """What both sides must have alike."""
+
+    coupling: CouplingName = "force_position"
+    passive: bool = True
+    session: int | None = 1
+    """of both sides' runs; None: the time"""
+
+    def options(self) -> dict[str, Any]:
+        """For :class:`MasterSide` and :class:`SlaveSide`."""
+        return {
+            "coupling": self.coupling,
+            "passive": self.passive,
+            "session": self.session,
+            "tank": TankOptions(**TANK),
+            "link": LinkOptions(),
+        }
+
+
+def scripted(scene: Scene | None, motion_scale: float = 1.0) -> Hand:
+    """A hand that does what the scene asks for."""
+    path = None if scene is None else scene.path
+    return Hand() if path is None else Hand(wish=lambda t: np.asarray(path(t)) / motion_scale)
+
+
+def scripted_joints(scene: Scene | None, chosen: SlaveArm) -> Hand:
+    """The same at the joints of a leader arm."""
     arm, q = chosen.arm, chosen.q
-    if hand is None:
-        wish = (lambda time: q) if place is None else joint_path(arm, q, place.path, place.seconds)
-        hand = Hand(wish=wish, **JOINT_HAND)
-    leader = SimulatedLeader(arm, q, hand, seed=seed + 1)
-    tank, link = TankOptions(**TANK), LinkOptions()
-    limits = [j.limits for j in arm.joints]
-    return Setup(
-        scene=place,
-        device=leader,
-        slave=ServoSlave(arm, q, place, seed=seed),
-        master=MasterSide(
-            arm.n,
-            leader.force_limit,
-            coupling=coupling,
-            stiffness=6.0,
-            damping=0.1,
-            fill=0.02,
-            contact_damping=0.3,
-            hold_stiffness=5.0,
-            hold_damping=0.1,
-            acceleration=200.0,
-            resync_rate=10.0,
-            tank=tank,
-            link=link,
-            passive=passive,
-            session=1,
-        ),
-        follower=SlaveSide(
-            arm.n,
-            [limit.velocity for limit in limits],
-            lower=[limit.lower for limit in limits],
-            upper=[limit.upper for limit in limits],
-            force_limit=[limit.effort for limit in limits],
-            acceleration=60.0,
-            threshold=chosen.threshold,
-            coupling=coupling,
-            task_space=False,
-            gain=chosen.gain,
-            resync="approach",
-            resync_speed=0.2,
-            resync_acceleration=1.0,
-            wall=5.0,
-            tank=tank,
-            link=link,
-            passive=passive,
-            session=1,
-        ),
-        motion_scale=1.0,
-        seconds=10.0 if place is None else place.seconds,
-        assumed=chosen.assumed,
+    wish = (lambda time: q) if scene is None else joint_path(arm, q, scene.path, scene.seconds)
+    return Hand(wish=wish, **JOINT_HAND)
+
+
+def build_master(device: Device, shared: Shared) -> MasterSide:
+    """What the hand feels that holds a device."""
+    return MasterSide(3, device.force_limit, contact_damping=CONTACT_DAMPING, **shared.options())
+
+
+def build_slave(
+    scene: str | None,
+    *,
+    arm: str = "kuka_lbr_iiwa14",
+    shared: Shared,
+    stiffness: float = 2000.0,
+    press: float = 0.02,
+    masses: tuple[float, ...] | None = None,
+    motion_scale: float | None = None,
+    force_scale: float | None = None,
+    stiffest: float = STIFFEST,
+    seed: int = 0,
+) -> tuple[InScene, SlaveSide, Scene | None, tuple[str, ...]]:
+    """An arm in a scene, where it goes, the scene, and what is assumed of it; options of :func:`build`.
+
+    Raises:
+        InputError: a name or a number is wrong.
+        MissingExtraError: mujoco is not installed.
+    """
+    chosen = slave_arm(arm)
+    T = chosen.arm.forward_kinematics(chosen.q)
+    tip: Array = T[:3, :3] @ chosen.arm.grasp + T[:3, 3]
+    lifted = chosen.masses if masses is None else masses
+    place = None if scene is None else find(scene, tip, stiffness=stiffness, press=press, masses=lifted)
+    if chosen.kind == "servos":
+        return ServoSlave(chosen.arm, chosen.q, place, seed=seed), _led(chosen, shared), place, chosen.assumed
+    slave = (
+        IndustrialSlave(chosen.arm, chosen.q, place, seed=seed)
+        if chosen.kind == "phase_currents"
+        else SimulatedSlave(chosen.arm, chosen.q, place, seed=seed, stiffest=stiffest)
+    )
+    side = SlaveSide(
+        3,
+        chosen.speed,
+        lower=tip - REACH,
+        upper=tip + REACH,
+        force_limit=chosen.force_limit,
+        acceleration=ACCELERATION,
+        threshold=chosen.threshold,
+        gain=chosen.gain,
+        motion_scale=chosen.motion_scale if motion_scale is None else motion_scale,
+        force_scale=chosen.force_scale if force_scale is None else force_scale,
+        **shared.options(),
+    )
+    return slave, side, place, chosen.assumed
+
+
+def _leading(n: int, device: Device, shared: Shared) -> MasterSide:
+    """What a hand feels that leads a twin: [rad, N m] in place of [m, N]."""
+    return MasterSide(
+        n,
+        device.force_limit,
+        stiffness=6.0,
+        damping=0.1,
+        fill=0.02,
+        contact_damping=0.3,
+        hold_stiffness=5.0,
+        hold_damping=0.1,
+        acceleration=200.0,
+        resync_rate=10.0,
+        **shared.options(),
+    )
+
+
+def _led(chosen: SlaveArm, shared: Shared) -> SlaveSide:
+    """Where the twin goes."""
+    limits = [j.limits for j in chosen.arm.joints]
+    return SlaveSide(
+        chosen.arm.n,
+        [limit.velocity for limit in limits],
+        lower=[limit.lower for limit in limits],
+        upper=[limit.upper for limit in limits],
+        force_limit=[limit.effort for limit in limits],
+        acceleration=60.0,
+        threshold=chosen.threshold,
+        task_space=False,
+        gain=chosen.gain,
+        resync="approach",
+        resync_speed=0.2,
+        resync_acceleration=1.0,
+        wall=5.0,
+        **shared.options(),
     )

@@ -1,0 +1,330 @@
+"""The live page of a teleoperator: device and arm in 3-D, forces felt and true, a network to be made worse."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arm import Array
+from ..report._style import LIGHT
+from ..report._text import escape
+from ..teleop.channel import Faults
+from ..teleop.coupling import Event, event_words
+from ..teleop.ends import PERIOD
+from ..teleop.scenes import smooth
+from ..teleop.session import Run, Wish
+from ..teleop.setups import Setup
+from .page import _STYLE, _drawn, _no_share, _viser, _wxyz, check_address
+from .scene import link_frames
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+FPS = 15.0
+"""updates of the page per second [Hz]"""
+_SPAN_S = 10.0
+"""how far back the curves go [s]"""
+_POINTS = 500
+_NEWTONS = 0.02
+"""length of an arrow [m/N]"""
+_ASIDE = np.array([0.0, -0.7, 0.0])
+"""where the device is drawn, from the tool's place at the start [m]"""
+_TAKE_OVER_S = 1.5
+"""over which a hand goes from the script to the sliders and back [s]"""
+_TRUE, _FELT, _ESTIMATED = LIGHT["ink"], LIGHT["red"], LIGHT["blue"]
+
+
+class Person:
+    """A wish for the hand that a page can take over from the script, without a jump.
+
+    Args:
+        script: where the hand wants to be at a time [s], (3,) [m]; begins anew after `seconds`.
+        seconds: how long the script is [s].
+    """
+
+    def __init__(self, script: Callable[[float], Array], seconds: float) -> None:
+        self._script, self._seconds = script, seconds
+        self._place = np.zeros(3)
+        self._from, self._since, self._own = np.zeros(3), -math.inf, False
+        self._now = 0.0
+
+    def __call__(self, time: float) -> Array:
+        """(3,) where the hand wants to be [m]."""
+        self._now = time
+        wanted = self._place if self._own else np.asarray(self._script(math.fmod(time, self._seconds)))
+        part = smooth((time - self._since) / _TAKE_OVER_S)
+        found: Array = self._from + part * (wanted - self._from)
+        return found
+
+    def go(self, place: Array | None) -> None:
+        """From now on this place (3,) [m]; None: the script's."""
+        self._from, self._since = self(self._now), self._now
+        self._own = place is not None
+        self._place = np.zeros(3) if place is None else np.asarray(place, dtype=np.float64)
+
+
+class TeleopPage:
+    """Shows a run while it goes on. Give :meth:`tap` to it; in real time, or slower where the computer is.
+
+    Args:
+        setup: what runs.
+        person: the hand's wish, see :class:`Person`; None: it cannot be taken over.
+        faults: of the network at the start.
+        host: address to listen at.
+        port: 0: any free one.
+
+    Raises:
+        InputError: the address is taken.
+        MissingExtraError: viser is not installed.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        *,
+        person: Person | None = None,
+        faults: Faults | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> None:
+        viser = _viser()
+        check_address(host, port)
+        with contextlib.redirect_stdout(io.StringIO()):  # it greets with a table of its own
+            self._server: ViserServer = viser.ViserServer(
+                host=host, port=port, label="palpate teleop", verbose=False
+            )
+        vars(self._server)["request_share_url"] = _no_share
+        self.url = f"http://{host}:{self._server.get_port()}"
+        self.faults, self.cut = faults or Faults(), False
+        """what the network does now; set by the page"""
+        self.closed = True
+        """the clutch; set by the page"""
+        self._setup, self._person = setup, person
+        self._run: tuple[Run, int] | None = None
+        self._begin = math.nan
+        self._over = threading.Event()
+        self.frames = 0
+        """updates made so far"""
+        self._build_scene()
+        self._build_controls()
+        self._thread = threading.Thread(target=self._show, daemon=True)
+        self._thread.start()
+
+    # --- building ------------------------------------------------------------------------------------------------
+
+    def _build_scene(self) -> None:
+        server, arm = self._server, self._setup.slave.model
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        server.scene.configure_default_lights(enabled=True, cast_shadow=False)
+        server.scene.add_grid("/floor", width=4.0, height=4.0, cell_size=0.1, section_size=0.5)
+        self._frames = [server.scene.add_frame(f"/slave/link{i}", show_axes=False) for i in range(arm.n + 1)]
+        self._shapes = [handle for _, handle, _ in _drawn(server.scene, "/slave", arm, False)]
+        self._tip = np.array(self._setup.slave.x)
+        self._device = self._tip + _ASIDE
+        server.scene.add_box(
+            "/device/space",
+            dimensions=(0.6, 0.6, 0.6),
+            position=self._device,
+            color=(200, 208, 216),
+            opacity=0.12,
+        )
+        self._handle = server.scene.add_icosphere("/device/handle", radius=0.02, color=(0, 114, 178))
+        server.scene.add_label("/device/name", "device", position=self._device + np.array([0.0, 0.0, 0.34]))
+        server.scene.add_label("/slave/name", "slave", position=(0.0, 0.0, 1.3))
+        self._goal = server.scene.add_icosphere("/goal", radius=0.018, color=(0, 114, 178), opacity=0.35)
+        self._boxes = self._touched()
+        self._arrows = {
+            name: server.scene.add_line_segments(
+                f"/force/{name}",
+                points=np.zeros((1, 2, 3)),
+                colors=colour,
+                thickness=5.0,
+                thickness_units="screen",
+            )
+            for name, colour in (("true", (30, 30, 30)), ("felt", (213, 94, 0)))
+        }
+        server.initial_camera.position = self._tip + np.array([1.1, -1.7, 0.7])
+        server.initial_camera.look_at = self._tip + 0.4 * _ASIDE - np.array([0.15, 0.0, 0.05])
+
+    def _touched(self) -> list[tuple[int, Any]]:
+        """Boxes of the scene, with their geoms."""
+        plant, found = self._setup.slave.plant, []
+        for geom in range(plant.model.ngeom):
+            name = plant.model.body(plant.model.geom_bodyid[geom]).name
+            if plant.model.geom_type[geom] != _box_type() or name.startswith("arm:"):
+                continue
+            r, g, b = (round(255 * float(c)) for c in plant.model.geom_rgba[geom][:3])
+            size = 2.0 * np.array(plant.model.geom_size[geom])
+            found.append(
+                (geom, self._server.scene.add_box(f"/scene/{geom}", dimensions=size, color=(r, g, b)))
+            )
+        return found
+
+    def _build_controls(self) -> None:
+        gui = self._server.gui
+        self._words = gui.add_html("")
+        self._said = ""
+        with gui.add_folder("Network, each way"):
+            fields = {
+                "delay": gui.add_slider("delay [ms]", 0.0, 500.0, 5.0, 1e3 * self.faults.delay),
+                "jitter": gui.add_slider("jitter [ms]", 0.0, 100.0, 5.0, 1e3 * self.faults.jitter),
+                "loss": gui.add_slider("loss [%]", 0.0, 50.0, 1.0, 100.0 * self.faults.loss),
+            }
+
+            def changed(_: Any) -> None:
+                self.faults = Faults(
+                    delay=1e-3 * fields["delay"].value,
+                    jitter=1e-3 * fields["jitter"].value,
+                    loss=1e-2 * fields["loss"].value,
+                )
+
+            for handle in fields.values():
+                handle.on_update(changed)
+            cut = gui.add_button("Cut the link", color="red")
+
+            def cut_it(_: Any) -> None:
+                self.cut = not self.cut
+                cut.label = "Restore the link" if self.cut else "Cut the link"
+
+            cut.on_click(cut_it)
+        with gui.add_folder("Hand"):
+            clutch = gui.add_checkbox("clutch closed", True)
+
+            def clutched(_: Any) -> None:
+                self.closed = clutch.value
+
+            clutch.on_update(clutched)
+            if self._person is not None:
+                self._build_hand(self._person)
+        with gui.add_folder("Force on the tool"):
+            keys = (("true", _TRUE), ("estimated", _ESTIMATED), ("felt / scale", _FELT))
+            self._forces = self._plot(keys, "size [N]")
+        with gui.add_folder("Energy in the tanks"):
+            self._tanks = self._plot((("master", LIGHT["blue"]), ("slave", LIGHT["orange"])), "[J]")
+
+    def _build_hand(self, person: Person) -> None:
+        gui = self._server.gui
+        own = gui.add_checkbox("moved by these, not by the script", False)
+        axes = [gui.add_slider(f"{name} [mm]", -150.0, 150.0, 1.0, 0.0) for name in "xyz"]
+
+        def moved(_: Any) -> None:
+            person.go(1e-3 * np.array([a.value for a in axes]) if own.value else None)
+
+        own.on_update(moved)
+        for axis in axes:
+            axis.on_update(moved)
+
+    def _plot(self, keys: tuple[tuple[str, str], ...], unit: str) -> Any:
+        import viser.uplot as uplot
+
+        legend = "".join(
+            f'<span class="key"><i style="background:{colour}"></i>{name}</span>' for name, colour in keys
+        )
+        gui = self._server.gui
+        gui.add_html(f'{_STYLE}<div class="pp"><div class="line">{legend} {unit}</div></div>')
+        nothing = np.array([0.0, 1.0])
+        return gui.add_uplot(
+            data=(nothing,) * (1 + len(keys)),
+            series=(
+                uplot.Series(label="time [s]"),
+                *(uplot.Series(label=name, stroke=colour, width=1.4) for name, colour in keys),
+            ),
+            scales={"x": uplot.Scale(time=False)},
+            legend=uplot.Legend(show=False),
+            height=140,
+        )
+
+    # --- while it runs -------------------------------------------------------------------------------------------
+
+    def tap(self, k: int, run: Run) -> Wish:
+        """To be called at the end of every period `k`: it keeps real time, and tells what the page wants."""
+        self._run = run, k
+        now = time.monotonic()
+        if math.isnan(self._begin):
+            self._begin = now
+        ahead = self._begin + k * PERIOD - now
+        if ahead > 0.0:
+            time.sleep(ahead)
+        elif ahead < -0.1:
+            self._begin -= ahead
+        return Wish(self.faults, self.cut, self.closed)
+
+    def _show(self) -> None:
+        while not self._over.wait(1.0 / FPS):
+            self.update()
+
+    def update(self) -> None:
+        """Bring the page up to date."""
+        if self._run is None:
+            return
+        run, k = self._run
+        slave, scale = self._setup.slave, self._setup.follower.force_scale
+        with self._server.atomic():
+            for handle, T in zip(self._frames, link_frames(slave.model, run.q[k]), strict=True):
+                handle.wxyz, handle.position = _wxyz(T[:3, :3]), T[:3, 3]
+            self._handle.position = self._device + run.device[k]
+            self._goal.position = self._tip + self._setup.motion_scale * (run.device[k] - run.device[0])
+            for geom, box in self._boxes:
+                data = slave.plant.data
+                box.position = np.array(data.geom_xpos[geom])
+                box.wxyz = _wxyz(np.array(data.geom_xmat[geom]).reshape(3, 3))
+            self._arrows["true"].points = _line(run.tip[k], run.true[k])
+            self._arrows["felt"].points = _line(self._device + run.device[k], run.felt[k] / scale)
+            if self.frames % 3 == 0:
+                self._curves(run, k, scale)
+                self._say(run, k)
+        self.frames += 1
+
+    def _curves(self, run: Run, k: int, scale: float) -> None:
+        rows = np.arange(max(0, k + 1 - round(_SPAN_S / PERIOD)), k + 1)
+        rows = rows[:: max(1, len(rows) // _POINTS)]
+        if len(rows) < 2:
+            return
+        t = run.time[rows]
+        sizes = [np.linalg.norm(x[rows], axis=1) for x in (run.true, run.estimated, run.felt / scale)]
+        self._forces.data = (t, *sizes)
+        self._tanks.data = (t, *(np.ascontiguousarray(run.levels[rows, i]) for i in range(2)))
+
+    def _say(self, run: Run, k: int) -> None:
+        events = Event(int(run.master_events[k] | run.slave_events[k]))
+        reasons = [text for at, text in run.reasons[-1:] if run.holding]
+        words = "; ".join([*reasons, *filter(None, [event_words(events)])]) or "coupled"
+        dead = bool(events & Event.LINK)
+        tone = "#c43b1d" if dead else "#b07a00" if reasons or events else "#007a4d"
+        f, true, felt = self.faults, np.linalg.norm(run.true[k]), np.linalg.norm(run.felt[k])
+        lines = [
+            f'{_STYLE}<div class="pp"><span class="badge" style="background:{tone}">'
+            f"{'held' if dead else 'coupled' if not events else 'limited'}</span>",
+            f'<div class="line">{escape(words)}</div>',
+            f'<div class="line">time <b>{run.time[k]:.0f} s</b>, force true <b>{true:.1f} N</b>, '
+            f"felt <b>{felt:.1f} N</b></div>",
+            f'<div class="line">delay {1e3 * f.delay:.0f} ms, jitter {1e3 * f.jitter:.0f} ms, '
+            f"loss {100.0 * f.loss:.0f} %{', cut' if self.cut else ''}</div></div>",
+        ]
+        text = "".join(lines)
+        if text != self._said:
+            self._words.content = self._said = text
+
+    def close(self) -> None:
+        """End the page."""
+        self._over.set()
+        self._thread.join()
+        self._server.stop()
+
+
+def _box_type() -> int:
+    from ..simulate._model import mujoco
+
+    return int(mujoco().mjtGeom.mjGEOM_BOX)
+
+
+def _line(tail: Array, force: Array) -> npt.NDArray[np.float32]:
+    return np.array([[tail, tail + _NEWTONS * force]], dtype=np.float32)
