@@ -36,7 +36,7 @@ STEP_CALLS = 200_000
 PRESSED_UNTIL = 6.4
 """the hand presses the rigid wall until then [s]"""
 BOUNCES, UNSTEADY = 5, 0.1
-"""of a stable contact with a rigid wall, at most: losses of the touch, and part of the force held by which it changes"""
+"""of a stable contact with a rigid wall, at most: losses of the touch, and the part of the force by which it changes"""
 
 
 def _circle(time: float) -> Array:
