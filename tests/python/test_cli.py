@@ -541,6 +541,7 @@ def test_the_real_studies_are_known(palpate) -> None:
     [
         *("", *VERBS, "arm show", "arm export", "arm list", "data get", "data list", "data path"),
         *("ros run", "ros launch", "ros list", "ros echo"),
+        *("teleop run", "teleop slave", "teleop master", "teleop key", "teleop join"),
     ],
 )
 def test_every_verb_has_help_with_examples(verb: str, palpate) -> None:

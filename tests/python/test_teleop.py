@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +151,7 @@ pytest.importorskip("cryptography")
 
 from palpate.teleop import scenes  # noqa: E402
 from palpate.teleop.channel import Faults  # noqa: E402
-from palpate.teleop.figures import transparency  # noqa: E402
+from palpate.teleop.figures import contact, transparency  # noqa: E402
 from palpate.teleop.session import Cut  # noqa: E402
 from palpate.teleop.setups import build  # noqa: E402
 
@@ -165,6 +166,21 @@ def test_a_wall_feels_like_itself() -> None:
     assert found.round_trip == pytest.approx(1e-3) and 1e5 < found.bandwidth[0] < 1e7
     for tank in found.tanks.values():
         assert tank["lowest"] >= 0.0
+
+
+def test_contact_with_a_rigid_wall_is_steady() -> None:
+    found = contact(build("rigid").run(seconds=5.0), 5.0)
+    assert found.held > 3.0 and found.unsteady < 0.1 * found.held and found.bounces <= 5
+    stiff = contact(build("rigid", stiffest=math.inf).run(seconds=5.0), 5.0)
+    assert stiff.unsteady > 2.0 * found.unsteady
+    with pytest.raises(InputError, match="stiffest"):
+        build("rigid", stiffest=0.0)
+
+
+def test_four_channels_feel_a_wall_like_itself() -> None:
+    found = build("wall", stiffness=2000.0, coupling="four_channel").run(seconds=6.0)
+    t = transparency(found, stiffness=2000.0)
+    assert t.force_error < 0.05 and t.stiffness > 0.9
 
 
 def test_a_dead_link_holds_and_comes_back_without_a_jump() -> None:

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .._core import teleop_step_times
 from ..arm import Array
 from ..teleop.channel import Faults
-from ..teleop.coupling import MasterSide, SlaveSide
-from ..teleop.figures import SETTLED, Transparency, jumps, transparency
+from ..teleop.coupling import COUPLINGS
+from ..teleop.figures import SETTLED, Contact, Transparency, contact, jumps, transparency
 from ..teleop.masters import Hand
 from ..teleop.scenes import smooth
 from ..teleop.session import Cut, Run
 from ..teleop.setups import build
+from ..teleop.slaves import STIFFEST
 from . import Progress, Row, _figures, _teleop_slaves
 from ._rows import at_most, told
 
@@ -30,7 +32,11 @@ STIFFNESS = (500.0, 2000.0, 5000.0)
 """of the walls [N/m]"""
 CUTS = (0.1, 0.5, 1.5, 4.0, 10.0)
 """[s]"""
-STEP_CALLS = 20_000
+STEP_CALLS = 200_000
+PRESSED_UNTIL = 6.4
+"""the hand presses the rigid wall until then [s]"""
+BOUNCES, UNSTEADY = 5, 0.1
+"""of a stable contact with a rigid wall, at most: losses of the touch, and the part of the force by which it changes"""
 
 
 def _circle(time: float) -> Array:
@@ -46,7 +52,7 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     cuts = CUTS[1:2] if quick else CUTS
     whole = 5.5 if quick else None
     more = _teleop_slaves.QUICK_JOBS if quick else _teleop_slaves.JOBS
-    total, begin, done = len(walls) + len(cuts) + 4 + more, clock.perf_counter(), 0
+    total, begin, done = len(walls) + len(cuts) + len(COUPLINGS) + 6 + more, clock.perf_counter(), 0
 
     def next_one() -> None:
         nonlocal done
@@ -72,9 +78,24 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     next_one()
     without = build("wall", stiffness=5000.0, passive=False).run(seconds=whole, faults=bad)
     next_one()
-    times = _step_times(STEP_CALLS // 20 if quick else STEP_CALLS)
+    rigid: dict[str, Contact] = {}
+    for name, stiffest in (("gives way", STIFFEST), ("does not give way", math.inf)):
+        found = build("rigid", stiffest=stiffest).run(seconds=4.0 if quick else PRESSED_UNTIL)
+        rigid[name] = contact(found, PRESSED_UNTIL)
+        next_one()
+    coupled: dict[str, Transparency] = {}
+    for coupling in COUPLINGS:
+        if coupling == "force_position" and 2000.0 in pressed:
+            coupled[coupling] = pressed[2000.0][1]
+        else:
+            found = build("wall", stiffness=2000.0, coupling=coupling).run(seconds=whole)
+            coupled[coupling] = transparency(found, stiffness=2000.0)
+        next_one()
+    felt, followed = teleop_step_times(STEP_CALLS // 20 if quick else STEP_CALLS)
+    times = {"master": felt, "slave": followed}
     next_one()
     rows = _rows(free, pressed, dead, with_layer, without, times)
+    rows += _rigid_rows(rigid) + _coupling_rows(coupled)
     rows += _teleop_slaves.rows(quick, next_one)
     setup_notes = [
         "Slave: KUKA LBR iiwa 14 in MuJoCo with a stick of 12 cm, its model known exactly; encoders of 1 "
@@ -91,26 +112,50 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
         "follows by the position control of its drives. The device moves it with motion scale 2 and force scale 0.05.",
         "SO-101: five joints from TheRobotStudio's files, friction of the STS3215 as Rhoban/bam measured it, encoders "
         "of 12 bit, currents in steps of 6.5 mA, 250 Hz; the leader is a twin in a hand, coupled joint to joint.",
+        "Rigid wall: a box that is welded to the world; MuJoCo's contact with it is as stiff as 0.6 kN/mm. Beyond "
+        f"{STIFFEST / 1e3:g} kN/m of what it touches the slave gives way like a spring.",
     ]
     return rows, _figures.drawn(lambda: _draw(free_run, pressed, with_layer, without)), setup_notes
 
 
-def _step_times(calls: int) -> Mapping[str, Array]:
-    """(N,) [s] of one step of each side, called from Python."""
-    master = MasterSide(3, 8.5, contact_damping=30.0)
-    slave = SlaveSide(3, 0.5, lower=-1.0, upper=1.0, force_limit=50.0)
-    x, v, force, std = np.zeros(3), np.full(3, 0.1), np.array([-2.0, 0.5, 0.0]), np.full(3, 0.1)
-    taken = {"master": np.empty(calls), "slave": np.empty(calls)}
-    for k in range(calls):
-        a = clock.perf_counter()
-        master.step(x, v, 1e-3, k)
-        b = clock.perf_counter()
-        slave.step(x, v, force, std, 1e-3, k)
-        taken["slave"][k], taken["master"][k] = clock.perf_counter() - b, b - a
-        if k % 20 == 0:
-            slave.receive(master.message())
-            master.receive(slave.message())
-    return taken
+def _rigid_rows(rigid: Mapping[str, Contact]) -> list[Row]:
+    ours, stiff = rigid.values()
+    return [
+        at_most(
+            "rigid wall: the touch is lost while the hand presses, times",
+            BOUNCES,
+            ours.bounces,
+            "",
+            f"{stiff.bounces} where the slave does not give way",
+        ),
+        at_most(
+            "rigid wall: true force changes while it is held, standard deviation",
+            100.0 * UNSTEADY,
+            100.0 * ours.unsteady / ours.held,
+            "%",
+            f"of {ours.held:.1f} N; {100.0 * stiff.unsteady / stiff.held:.0f} % of {stiff.held:.1f} N where the "
+            "slave does not give way",
+        ),
+        told(
+            "rigid wall: largest true force, the first touch included",
+            ours.peak,
+            "N",
+            f"{stiff.peak:.1f} N where the slave does not give way",
+        ),
+    ]
+
+
+def _coupling_rows(coupled: Mapping[str, Transparency]) -> list[Row]:
+    return [
+        told(
+            f"{name}, wall of 2000 N/m: stiffness felt, part of what the tool meets",
+            100.0 * t.stiffness,
+            "%",
+            f"force felt off the true one {100.0 * t.force_error:.1f} % at {t.force_held:.1f} N; free motion: tool "
+            f"off {1e3 * t.tracking:.2f} mm, force {t.free_force:.2f} N",
+        )
+        for name, t in coupled.items()
+    ]
 
 
 def _rows(
@@ -185,13 +230,15 @@ def _rows(
             )
         )
     for side, taken in times.items():
+        p50, p999, worst = (1e6 * float(x) for x in (*np.quantile(taken, (0.5, 0.999)), taken.max()))
         rows.append(
             at_most(
                 f"one step of the {side}'s side, median",
                 10.0,
-                1e6 * float(np.median(taken)),
+                p50,
                 "us",
-                f"called from Python, 99.9 % {1e6 * float(np.quantile(taken, 0.999)):.0f} us",
+                f"six axes, four-channel; 99.9 % {p999:.1f} us, worst of {len(taken)}: {worst:.0f} us, the computer's "
+                "own pauses included",
             )
         )
     return rows

@@ -87,6 +87,32 @@ def transparency(run: Run, *, force_scale: float = 1.0, stiffness: float | None 
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """How steadily something is touched. NaN: it is not touched."""
+
+    bounces: int
+    """times the touch is lost while the hand presses"""
+    peak: float
+    """largest true force [N]"""
+    held: float
+    """mean true force where it is held [N]"""
+    unsteady: float
+    """standard deviation of it there [N]"""
+
+
+def contact(run: Run, until: float) -> Contact:
+    """Of a hand that presses until a time [s]; it is held over the last second before."""
+    size = np.linalg.norm(run.true, axis=1)
+    inside = run.time < until
+    touched = size[inside] > _TOUCH
+    if not touched.any():
+        return Contact(0, math.nan, math.nan, math.nan)
+    late = size[inside & (run.time >= until - 1.0)]
+    bounces = int(np.count_nonzero(touched[:-1] & ~touched[1:]))
+    return Contact(bounces, float(size[inside].max()), float(late.mean()), float(late.std()))
+
+
 def jumps(run: Run, cuts: tuple[Cut, ...]) -> tuple[float, float, float]:
     """After dead links, over half a second from each return: the largest change within 10 ms of the force of the
     device [N] and of the
