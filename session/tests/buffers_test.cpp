@@ -6,6 +6,7 @@
 #include <atomic>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <stdexcept>
 #include <thread>
 #include <vector>
@@ -36,29 +37,61 @@ struct Block {
   }
 };
 
+template <class T>
+bool push(Ring& ring, const T& value) {
+  std::byte* const to = ring.draft();
+  if (to == nullptr) return false;
+  std::memcpy(to, &value, sizeof value);
+  ring.push();
+  return true;
+}
+
+template <class T>
+bool take(Ring& ring, T& value) {
+  const std::byte* const from = ring.front();
+  if (from == nullptr) return false;
+  std::memcpy(&value, from, sizeof value);
+  ring.pop();
+  return true;
+}
+
 TEST(Ring, GivesBackWhatWasPushedInOrderAndCountsWhatDidNotFit) {
-  Ring<int> ring(3);
+  Ring ring(3, sizeof(int));
   EXPECT_EQ(ring.capacity(), 4u);  // the next power of two
-  for (int i = 0; i < 4; ++i) EXPECT_TRUE(ring.push(i));
-  EXPECT_FALSE(ring.push(4));
-  EXPECT_FALSE(ring.push(5));
+  for (int i = 0; i < 4; ++i) EXPECT_TRUE(push(ring, i));
+  EXPECT_FALSE(push(ring, 4));
+  EXPECT_FALSE(push(ring, 5));
   EXPECT_EQ(ring.dropped(), 2u);
   int out = -1;
   for (int i = 0; i < 4; ++i) {
-    ASSERT_TRUE(ring.take(out));
+    ASSERT_TRUE(take(ring, out));
     EXPECT_EQ(out, i);
   }
-  EXPECT_FALSE(ring.take(out));
-  EXPECT_TRUE(ring.push(6));  // room again
+  EXPECT_FALSE(take(ring, out));
+  EXPECT_TRUE(push(ring, 6));  // room again
   EXPECT_EQ(ring.size(), 1u);
-  EXPECT_THROW(Ring<int>(0), std::invalid_argument);
+  EXPECT_THROW(Ring(0, 4), std::invalid_argument);
+  EXPECT_THROW(Ring(4, 0), std::invalid_argument);
+}
+
+TEST(Ring, WhatWasTakenIsStillThereUntilItsPlaceIsUsedAgain) {
+  Ring ring(4, sizeof(int));
+  int out = 0;
+  EXPECT_EQ(ring.back(0), nullptr);
+  for (int i = 0; i < 6; ++i) push(ring, i), take(ring, out);
+  for (int age = 0; age < 4; ++age) {
+    ASSERT_NE(ring.back(static_cast<std::size_t>(age)), nullptr);
+    std::memcpy(&out, ring.back(static_cast<std::size_t>(age)), sizeof out);
+    EXPECT_EQ(out, 5 - age);
+  }
+  EXPECT_EQ(ring.back(4), nullptr);
 }
 
 TEST(Ring, BetweenTwoThreadsTakenAndDroppedMakeAll) {
-  Ring<Block> ring(64);
+  Ring ring(64, sizeof(Block));
   std::atomic<bool> over{false};
   std::thread producer([&] {
-    for (std::uint64_t i = 0; i < many; ++i) ring.push(Block::of(i));
+    for (std::uint64_t i = 0; i < many; ++i) push(ring, Block::of(i));
     over.store(true, std::memory_order_release);
   });
   std::uint64_t taken = 0, last = 0;
@@ -66,7 +99,7 @@ TEST(Ring, BetweenTwoThreadsTakenAndDroppedMakeAll) {
   Block b;
   for (;;) {
     const bool end = over.load(std::memory_order_acquire);  // before the look: what comes after it was seen
-    while (ring.take(b)) {
+    while (take(ring, b)) {
       whole = whole && b.whole();
       rising = rising && (taken == 0 || b.words[0] > last);
       last = b.words[0];
@@ -81,11 +114,11 @@ TEST(Ring, BetweenTwoThreadsTakenAndDroppedMakeAll) {
 }
 
 TEST(Ring, AllocatesNothingAfterItsConstruction) {
-  Ring<Block> ring(8);
+  Ring ring(8, sizeof(Block));
   const Block b = Block::of(1);
   Block out;
   palpate::test::AllocationCounter counter;
-  for (int i = 0; i < 100; ++i) ring.push(b), ring.push(b), ring.take(out);
+  for (int i = 0; i < 100; ++i) push(ring, b), push(ring, b), take(ring, out);
   EXPECT_EQ(counter.count(), 0u);
 }
 

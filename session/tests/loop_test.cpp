@@ -3,7 +3,9 @@
 
 #include <gtest/gtest.h>
 
+#include <array>
 #include <cmath>
+#include <cstddef>
 #include <cstring>
 #include <limits>
 #include <memory>
@@ -393,6 +395,56 @@ TEST(ControlLoop, WhatTheOwnerDoesNotTakeIsCountedAndTheNewestIsInTheBlackBox) {
   const std::vector<Record> box = s.loop->black_box();
   ASSERT_EQ(box.size(), 16u);
   for (std::size_t i = 0; i < box.size(); ++i) EXPECT_EQ(box[i].tick, 84 + i);
+}
+
+TEST(ControlLoop, ARecordPassesItsShortFormWholeAndNoLongerThanTheArmNeeds) {
+  const std::size_t little = RecordFormat(7, false, false).bytes(), all = RecordFormat(max_joints, true, true).bytes();
+  EXPECT_LT(3 * little, 2 * sizeof(Record));
+  EXPECT_LE(all, sizeof(Record));
+  Record r;
+  double x = 0.0;
+  for (JointVector* v : {&r.raw.position, &r.raw.velocity, &r.raw.effort, &r.raw.model_torque, &r.touch.q, &r.touch.dq, &r.touch.external.torque, &r.touch.external.std,
+                         &r.touch.external.noise, &r.touch.contact.torque, &r.touch.contact.std, &r.touch.contact.level, &r.setpoint.q, &r.setpoint.dq, &r.setpoint.ddq,
+                         &r.wanted, &r.sent})
+    for (double& value : *v) value = ++x;
+  r.tick = 7, r.mode = Mode::enabled, r.control = Status::saturated, r.limited = 3, r.tare = 0.1, r.tare_std = 0.2, r.tares = 5;
+  r.late_ns = 11, r.read_ns = 12, r.step_ns = 13, r.write_ns = 14;
+  r.raw.time_ns = r.touch.time_ns = 99;
+  r.touch.status = r.touch.external.status = r.touch.wrench.status = r.touch.contact.status = Status::ok;
+  r.touch.payload.mass = 0.25, r.touch.wrench.force = {1, 2, 3}, r.touch.contact.link = 2, r.touch.contact.active = true;
+  std::array<std::byte, sizeof(Record)> packed{};
+  const auto same_bits = [](const auto& a, const auto& b) { return std::memcmp(&a, &b, sizeof a) == 0; };
+  for (const bool flags : {false, true}) {
+    r.raw.has_velocity = r.raw.has_model_torque = r.commanded = flags;
+    for (const bool more : {false, true}) {
+      const RecordFormat format(max_joints, more, more);
+      EXPECT_LE(format.pack(r, packed.data()), format.bytes());
+      Record out;
+      out.raw.velocity.fill(-1.0);
+      format.unpack(packed.data(), out);
+      EXPECT_TRUE(same(r, out) || !flags);
+      EXPECT_EQ(out.raw.time_ns, 99);
+      EXPECT_EQ(out.raw.position, r.raw.position);
+      EXPECT_EQ(out.raw.velocity, flags ? r.raw.velocity : JointVector{});
+      EXPECT_EQ(out.raw.model_torque, flags ? r.raw.model_torque : JointVector{});
+      EXPECT_EQ(out.sent, flags ? r.sent : JointVector{});
+      EXPECT_EQ(out.wanted, flags ? r.wanted : JointVector{});
+      EXPECT_TRUE(same_bits(out.setpoint, flags ? r.setpoint : Setpoint{}));
+      EXPECT_EQ(out.touch.external.std, r.touch.external.std);
+      EXPECT_EQ(out.touch.external.noise, r.touch.external.noise);
+      EXPECT_TRUE(same_bits(out.touch.payload, r.touch.payload));
+      EXPECT_EQ(out.touch.wrench.status, Status::ok);
+      EXPECT_EQ(out.touch.contact.status, Status::ok);
+      EXPECT_EQ(out.touch.wrench.force, more ? r.touch.wrench.force : Wrench{}.force);
+      EXPECT_EQ(out.touch.contact.link, more ? 2 : -1);
+      EXPECT_EQ(out.touch.contact.level, more ? r.touch.contact.level : JointVector{});
+      EXPECT_EQ(out.tick, 7u);
+      EXPECT_EQ(out.tares, 5u);
+      EXPECT_EQ(out.tare_std, 0.2);
+      EXPECT_EQ(out.write_ns, 14);
+      EXPECT_EQ(out.limited, 3);
+    }
+  }
 }
 
 TEST(ControlLoop, WhatDoesNotFitIsRefused) {

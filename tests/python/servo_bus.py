@@ -93,6 +93,8 @@ class ServoBus:
         self.baud, self.usb, self.corrupt, self.drop = baud, usb, corrupt, drop
         self.noise_counts = noise_counts
         self.dead: set[int] = set()
+        self.missed: float | None = None
+        """when a dead servo was first asked in vain [s]"""
         self.said: dict[int, list[int]] = {s.id: [] for s in servos}
         """positions that left each servo, undamaged [counts]"""
         self.damaged = self.dropped = self.questions = 0
@@ -184,7 +186,7 @@ class ServoBus:
         """Answers one after the other; where one stays away, those behind it wait in vain."""
         found = []
         for servo in ids:
-            if servo in self.dead or servo not in self.tables:
+            if not self.lives(servo):
                 break
             if self._rng.random() < self.drop:
                 self.dropped += 1
@@ -192,8 +194,13 @@ class ServoBus:
             found.append(self.status(servo, self.look(servo, address, length)))
         return found
 
+    def lives(self, servo: int) -> bool:
+        if servo in self.dead and self.missed is None:
+            self.missed = time.monotonic()
+        return servo in self.tables and servo not in self.dead
+
     def alive(self, servo: int) -> bool:
-        if servo not in self.tables or servo in self.dead:
+        if not self.lives(servo):
             return False
         if self._rng.random() < self.drop:
             self.dropped += 1
@@ -445,10 +452,11 @@ def main(text: str) -> None:
                 time.sleep(0.01)
             time.sleep(options["die_after"])
             bus.dead.add(options["die"])
-            died = time.monotonic()
-            while any(t[bus.ENABLE] for i, t in bus.tables.items() if i not in bus.dead):
+            while bus.missed is None:
                 time.sleep(1e-4)
-            off_s = time.monotonic() - died
+            while bus.world.torque.any():  # of the others: a dead servo pushes nothing
+                time.sleep(1e-4)
+            off_s = time.monotonic() - bus.missed
         sys.stdin.read()
     said = {"questions": bus.questions, "damaged": bus.damaged, "dropped": bus.dropped}
     if options.get("die"):

@@ -10,7 +10,7 @@ from palpate.logs import Log
 from palpate.studies import _rivals, accuracy
 from recordings import data_folder
 
-pytest.importorskip("scipy")
+pytest.importorskip("scipy", reason="palpate[identify] is not installed")
 
 
 def test_without_recordings_every_job_says_so(monkeypatch, tmp_path):

@@ -15,8 +15,8 @@ from palpate import robots
 from palpate.arm import Arm, Effort, Friction, Joint, Limits, Sensing, Shape
 from palpate.errors import ArmError, MissingExtraError
 
-pytest.importorskip("pydantic")
-yaml = pytest.importorskip("yaml")
+pytest.importorskip("pydantic", reason="palpate[card] is not installed")
+yaml = pytest.importorskip("yaml", reason="palpate[card] is not installed")
 
 numbers = st.floats(-1e8, 1e8, allow_nan=False)
 positive = st.floats(0, 1e8, allow_nan=False)

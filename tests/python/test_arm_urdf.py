@@ -593,7 +593,7 @@ XACRO = changed('xyz="0.4 0 0"', "xyz=\"${2 * float('$(arg reach)') / 2} 0 0\"",
 
 
 def test_xacro_file_and_text(tmp_path):
-    pytest.importorskip("xacro")
+    pytest.importorskip("xacro", reason="palpate[xacro] is not installed")
     path = tmp_path / "two.urdf.xacro"
     path.write_text(XACRO)
     for source in (path, str(path), XACRO):

@@ -11,7 +11,7 @@ from palpate import Arm, Shape
 from palpate.errors import InputError
 from palpate.identify import mesh_body, printed_complaint, with_meshes
 
-trimesh = pytest.importorskip("trimesh")
+trimesh = pytest.importorskip("trimesh", reason="palpate[cad] is not installed")
 
 
 def box(

@@ -215,6 +215,13 @@ def test_files_of_others_are_not_replaced(palpate, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "arguments, words",
     [
+        ("weigh justina_left_arm", "given as --arm justina_left_arm"),
+        ("view kuka_lbr_iiwa7", "given as --arm kuka_lbr_iiwa7"),
+        ("feel arm.urdf --arm justina_left_arm", "given as --arm arm.urdf"),
+        *(
+            (f"{verb} --seed -1", "--seed")
+            for verb in ("weigh", "simulate", "view", "wipe", "teleop", "excite")
+        ),
         ("weigh --pose Tkae3", "did you mean 'Take3'"),
         ("weigh --pose 1,2", "has 7 joints, got 2 angles"),
         ("weigh --pose 9,0,0,0,0,0,0", "outside its limits"),
@@ -228,7 +235,6 @@ def test_files_of_others_are_not_replaced(palpate, tmp_path: Path) -> None:
         ("weigh --mass nan", "got nan"),
         ("weigh --mass inf", "got inf"),
         ("weigh --mass heavy", "--mass"),
-        ("weigh --seed -1", "seed must be a whole number >= 0"),
         ("weigh --seed 1.5", "--seed"),
         ("weigh --duration 0", "duration must be above 0"),
         ("weigh --duration nan", "duration"),

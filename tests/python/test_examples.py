@@ -98,5 +98,5 @@ def test_the_arm_of_the_manual_can_be_read_and_rehearsed_with():
         loads=((0.0, 0.2),),
         duration=4.0,
     )
-    found = weigh.weigh_session(weigh.run(task, weigh.make_pipeline(scene.arm)[0]))
+    found = weigh.weigh_trial(weigh.run(task, weigh.make_pipeline(scene.arm)[0]))
     assert found.status.name == "ok" and abs(found.error_percent) < 2.0

@@ -15,7 +15,7 @@ from palpate.errors import ArmError, InputError
 from palpate.identify import Excitation, excite, to_csv, to_ros
 from palpate.simulate import Clearance, rehearse
 
-pytest.importorskip("scipy")
+pytest.importorskip("scipy", reason="palpate[identify] is not installed")
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ from palpate.identify.regress import (
 )
 from palpate.logs import Log, Signal
 
-pytest.importorskip("scipy")
+pytest.importorskip("scipy", reason="palpate[identify] is not installed")
 
 RATE = 200.0
 

@@ -18,7 +18,7 @@ from palpate.identify import fit
 from palpate.logs import open_known
 from recordings import recording
 
-pytest.importorskip("scipy")
+pytest.importorskip("scipy", reason="palpate[identify] is not installed")
 
 RATE = 100.0
 GAIN = np.array([11.976, 11.976, 9.839, 10.763, 10.763, 10.763])

@@ -24,7 +24,7 @@ from palpate.identify.regress import Builder
 from palpate.logs import ColumnMap, Log, read_bam, read_tx40
 from palpate.studies.accuracy import GAIN, MASS, chosen_within, pendulum
 
-pytest.importorskip("scipy")
+pytest.importorskip("scipy", reason="palpate[identify] is not installed")
 
 
 def data(*parts: str) -> Path:

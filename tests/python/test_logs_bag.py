@@ -15,7 +15,7 @@ from palpate.logs import Log, messages
 from palpate.logs.mcap import McapReader
 
 rosbags = pytest.importorskip("rosbags.rosbag2", reason="needs palpate[logs]")
-typesys = pytest.importorskip("rosbags.typesys")
+typesys = pytest.importorskip("rosbags.typesys", reason="palpate[logs] is not installed")
 
 STORE = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 NAMES = ("shoulder", "elbow")
@@ -83,7 +83,10 @@ def test_every_storage_and_compression(tmp_path, plugin, compression):
 
 
 def test_lz4_chunks_and_files_by_the_mcap_library(tmp_path):
-    writer = pytest.importorskip("mcap_ros2.writer")
+    writer = pytest.importorskip(
+        "mcap_ros2.writer",
+        reason="palpate[test] is not installed",
+    )
     from mcap.writer import CompressionType
 
     for compression in CompressionType:

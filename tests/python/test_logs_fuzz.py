@@ -59,7 +59,10 @@ def streamed(path: Path) -> None:
 
 
 def compressed(path: Path) -> None:
-    writer = pytest.importorskip("mcap_ros2.writer")
+    writer = pytest.importorskip(
+        "mcap_ros2.writer",
+        reason="palpate[test] is not installed",
+    )
     from mcap.writer import CompressionType
 
     with path.open("wb") as file:

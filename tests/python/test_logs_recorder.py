@@ -296,8 +296,14 @@ def test_saved_and_opened_is_the_same_bit_for_bit(kind, log):
 
 
 def test_mcap_library_reads_every_message(tmp_path):
-    reader = pytest.importorskip("mcap.reader")
-    decoder = pytest.importorskip("mcap_ros2.decoder")
+    reader = pytest.importorskip(
+        "mcap.reader",
+        reason="palpate[test] is not installed",
+    )
+    decoder = pytest.importorskip(
+        "mcap_ros2.decoder",
+        reason="palpate[test] is not installed",
+    )
     record(tmp_path / "run.mcap", flush_s=0.0)
     with (tmp_path / "run.mcap").open("rb") as file:
         bag = reader.make_reader(file, validate_crcs=True, decoder_factories=[decoder.DecoderFactory()])
@@ -401,7 +407,7 @@ def test_any_message_can_be_recorded(tmp_path):
     wrench = log.signals["wrist/wrench"]
     np.testing.assert_array_equal(wrench.value, [[0, 0, -9.81, 0, 0, 0]])
     assert wrench.time_ns[0] == 10**9  # the stamp was filled in
-    highlevel = pytest.importorskip("rosbags.highlevel")
+    highlevel = pytest.importorskip("rosbags.highlevel", reason="palpate[logs] is not installed")
     with highlevel.AnyReader([tmp_path / "run.mcap"]) as bag:
         found = {c.topic: bag.deserialize(raw, c.msgtype) for c, _, raw in bag.messages()}
     np.testing.assert_array_equal(found["/wrist/imu"].orientation_covariance, np.arange(9))

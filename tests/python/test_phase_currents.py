@@ -301,7 +301,7 @@ def test_the_log_and_sample_must_hold_both_phases(arm):
 
 
 def test_cards_and_urdfs_keep_the_declaration(arm, tmp_path):
-    pytest.importorskip("yaml")
+    pytest.importorskip("yaml", reason="palpate[card] is not installed")
     arm.save(tmp_path / "arm.yaml")
     assert type(arm).from_card(tmp_path / "arm.yaml").effort == arm.effort
     assert type(arm).from_urdf(arm.to_urdf()).effort == arm.effort

@@ -26,7 +26,7 @@ from palpate.report import _series
 from palpate.report._text import clean, escape, mass_unit, number, rounded, status_text
 from palpate.report.figures import normalised_error
 
-matplotlib = pytest.importorskip("matplotlib")
+matplotlib = pytest.importorskip("matplotlib", reason="palpate[report] is not installed")
 
 EVIL = "</td><script>alert('1')</script>\"' $\\frac{ & -->\x00\u202e\ud800"
 
@@ -124,7 +124,8 @@ def written(report: R.WeighReport, folder: Path) -> tuple[str, Checker]:
 
 
 def test_statuses_are_those_of_the_core():
-    core = pytest.importorskip("palpate._core")
+    from palpate import _core as core
+
     assert {s.name: int(s) for s in core.Status} == {status_text(i).name: i for i in range(8)}
     assert status_text(200).name == "status 200"
     assert len({status_text(i).severity for i in range(9)}) == 9

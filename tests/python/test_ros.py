@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
@@ -24,10 +25,12 @@ from palpate.errors import DriverError, InputError
 
 pytest.importorskip("cyclonedds", reason="ROS 2 needs the extra ros")
 
-from palpate.ros import Node, RosArguments, RosDriver, SampleSource, messages
+from palpate.ros import LATCHED, Context, Node, RosArguments, RosDriver, SampleSource, messages
 from palpate.ros.arguments import params_file
+from palpate.ros.graphs import GRAPHS, TASKS
 from palpate.ros.launch import Launch, graph
 from palpate.ros.messages import (
+    CompressedImage,
     DiagnosticArray,
     Float64,
     Float64MultiArray,
@@ -51,7 +54,7 @@ from palpate.ros.messages import (
 )
 from palpate.ros.names import Remap, expand, namespace, node_name, plain_type, remapped
 from palpate.ros.parameters import Parameters
-from palpate.ros.tasks import TASKS, ArmSimulation
+from palpate.ros.tasks import ArmSimulation
 from palpate.weigh import Task, make_pipeline, run, scene
 from ros_here import DOMAIN, TAGGED, here, palpate_ros, until
 
@@ -486,9 +489,14 @@ class TestGraph:
                 node.publish(Float64, "x").publish(Float64("no number"))  # type: ignore[arg-type]
 
     def test_what_is_launched(self) -> None:
-        assert graph("mass-estimation") == tuple(TASKS)
+        assert graph("mass-estimation") == GRAPHS["mass-estimation"] and graph("wiping") == ("wipe", "camera")
+        assert sum(map(len, GRAPHS.values())) == len(TASKS)
         assert "control" not in graph("mass-estimation", ["control"])
-        for name, without in (("mass", []), ("mass-estimation", ["mas"]), ("mass-estimation", list(TASKS))):
+        for name, without in (
+            ("mass", []),
+            ("mass-estimation", ["mas"]),
+            ("mass-estimation", list(GRAPHS["mass-estimation"])),
+        ):
             with pytest.raises(InputError, match="mass-estimation"):
                 graph(name, without)
 
@@ -830,6 +838,113 @@ class TestTasks:
             assert status()[-1] not in ("", "ok")
 
 
+class TestBoard:
+    """The whiteboard's nodes."""
+
+    @pytest.fixture
+    def there(self) -> Iterator[Context]:
+        pytest.importorskip("cv2", reason="the whiteboard's nodes need the extra wipe")
+        pytest.importorskip("shapely", reason="the whiteboard's nodes need the extra wipe")
+        with Context(DOMAIN, localhost=True, largest=4096) as there:
+            yield there
+
+    @staticmethod
+    def drawn(dirty: bool) -> bytes:
+        """A JPEG of a white board on a dark wall."""
+        import cv2
+
+        picture = np.full((480, 640, 3), 90, np.uint8)
+        cv2.rectangle(picture, (100, 80), (540, 400), (245, 245, 245), -1)
+        if dirty:
+            cv2.line(picture, (200, 200), (400, 260), (180, 40, 20), 6)
+        return cv2.imencode(".jpg", picture)[1].tobytes()
+
+    def test_a_camera_tells_a_dirty_board_from_a_clean_one(self, there: Context) -> None:
+        with TASKS["camera"](there, quiet=True) as node, Node("eye", there, quiet=True) as me:
+            ink: list[float] = []
+            boards: list[str] = []
+            corners: list[str] = []
+            me.subscribe(Float64, "ink", lambda m, w: ink.append(m.data), LATCHED)
+            me.subscribe(String, "board", lambda m, w: boards.append(m.data), LATCHED)
+            me.subscribe(String, "corners", lambda m, w: corners.append(m.data), LATCHED)
+            pictures = me.publish(CompressedImage, "image/compressed", LATCHED)
+            until([me, node], lambda: pictures.readers and node._corners.readers, "a match")
+            for count, (picture, word) in enumerate(
+                [(self.drawn(True), "dirty"), (self.drawn(False), "clean")], 1
+            ):
+                pictures.publish(CompressedImage(Header(Time.of(count)), "jpeg", picture))
+                until([me, node], lambda count=count: len(corners) == count, "the verdict")
+                assert boards[-1] == word
+            assert ink[0] > 1e-3 > ink[1]
+            assert np.abs(np.array(json.loads(corners[-1])).min(axis=0) - [100, 80]).max() < 3
+            pictures.publish(CompressedImage(Header(Time.of(3)), "jpeg", b"\xff\xd8 no picture"))
+            until([me, node], lambda: node.troubles, "the complaint")
+            assert "'jpeg' cannot be decoded" in node.troubles[0]
+            pictures.publish(CompressedImage(Header(Time.of(4)), "jpeg", self.drawn(True)))
+            until([me, node], lambda: not node.troubles and len(corners) == 3, "recovery")
+            with pytest.raises(InputError, match="no method 'line'.*lines"):
+                node.parameters.set({"method": "line"})
+
+    def test_wiping_shows_what_its_camera_sees(self, there: Context) -> None:
+        """Until its first picture is judged; the whole job is the slow test's."""
+        with (
+            TASKS["camera"](there, quiet=True) as camera,
+            TASKS["wipe"](there, arguments("-p", "pace:=0.0", "-p", "rate:=20.0"), quiet=True) as node,
+            Node("eye", there, quiet=True) as me,
+        ):
+            doing: list[str] = []
+            joints: list[JointState] = []
+            boards: list[str] = []
+            me.subscribe(String, "wipe_state", lambda m, w: doing.append(m.data), LATCHED)
+            me.subscribe(String, "board", lambda m, w: boards.append(m.data), LATCHED)
+            me.subscribe(JointState, "joint_states", lambda m, w: joints.append(m))
+            commands = me.publish(String, "command")
+            until(
+                [me, camera, node], lambda: commands.readers and camera._one._subscription.writers, "a match"
+            )
+            commands.publish(String("hurry"))
+            until([me, camera, node], lambda: node.troubles, "the complaint")
+            assert "no command 'hurry'" in node.troubles[0]
+
+            def judged() -> bool:
+                me.spin_once(0.0)
+                camera.spin_once(0.0)
+                return bool(boards)
+
+            node.run(judged)
+            assert not node.finished and boards == ["dirty"]
+            assert doing[0] == "parking"
+            steps = np.diff([m.header.stamp.time_ns for m in joints])
+            assert len(joints) > 5 and np.abs(steps - 50_000_000).max() <= 4_000_000  # of whole cycles
+            assert tuple(joints[0].name) == node.job.scene.arms[0].joint_names
+
+    @pytest.mark.parametrize(
+        ("text", "words"), [("rate:=0.0", "rate"), ("hold:=maybe", "hold"), ("speed:=-1.0", "speed")]
+    )
+    def test_nonsense_is_refused(self, there: Context, text: str, words: str) -> None:
+        with pytest.raises(InputError, match=words):
+            TASKS["wipe"](there, arguments("-p", text), quiet=True)
+
+    @pytest.mark.slow
+    def test_two_processes_wipe_a_board_clean(self) -> None:
+        pytest.importorskip("shapely", reason="the whiteboard's nodes need the extra wipe")
+        launched = Launch(graph("wiping"), ["--ros-args", "-p", "wipe:pace:=0.0"], ["--quiet"])
+        with here() as there, Node("listener", there, quiet=True) as me:
+            told: dict[str, list[Any]] = {"verdict": [], "board": [], "ink_left": []}
+            me.subscribe(String, "verdict", lambda m, w: told["verdict"].append(m.data), LATCHED)
+            me.subscribe(String, "board", lambda m, w: told["board"].append(m.data), LATCHED)
+            me.subscribe(Float64, "ink_left", lambda m, w: told["ink_left"].append(m.data), LATCHED)
+            launched.start()
+            watcher = threading.Thread(target=launched.watch)
+            watcher.start()
+            try:
+                until([me], lambda: not watcher.is_alive() or told["verdict"], "the verdict")
+            finally:
+                watcher.join()
+            assert told["verdict"] == ["clean"]
+            assert told["board"][0] == "dirty" and told["ink_left"][-1] < 0.05
+
+
 LAUNCHED = ["-p", "arm_simulation:pace:=0.0", "-p", "arm_simulation:seed:=3"]
 
 
@@ -954,7 +1069,9 @@ class TestCommands:
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
     def test_a_launch_leaves_nothing_behind(self, number: int) -> None:
         """Whether it is asked to end or killed."""
-        without = [f"--without={name}" for name in TASKS if name not in ("mass", "trajectory")]
+        without = [
+            f"--without={name}" for name in GRAPHS["mass-estimation"] if name not in ("mass", "trajectory")
+        ]
         launched = palpate_ros("launch", "mass-estimation", *without)
         try:
             with here() as there, Node("watcher", there, quiet=True) as me:

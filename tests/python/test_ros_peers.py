@@ -19,8 +19,8 @@ pytest.importorskip("cyclonedds", reason="ROS 2 needs the extra ros")
 from palpate.errors import InputError
 from palpate.logs import Sample
 from palpate.ros import Context, Node, RosArguments, SampleSource
+from palpate.ros.graphs import TASKS
 from palpate.ros.messages import Header, InertiaStamped, JointState, Time
-from palpate.ros.tasks import TASKS
 from palpate.studies.ros2 import build_fastdds, build_rust
 from ros_here import DOMAIN, palpate_ros, until
 

@@ -14,7 +14,7 @@ from palpate.simulate.irb2400 import B
 from palpate.studies import _irb2400, _irb2400_force, _pulley_rig
 from palpate.studies._geared_arm import RATE, Run, simulate
 
-pytest.importorskip("scipy")
+pytest.importorskip("scipy", reason="palpate[identify] is not installed")
 
 
 @pytest.fixture(scope="module")

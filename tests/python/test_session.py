@@ -161,8 +161,8 @@ def test_other_gains_act_at_once():
 
 
 def test_a_driver_in_python_serves_by_the_same_contract():
-    mujoco = pytest.importorskip("palpate.drivers.mujoco")
-    pytest.importorskip("mujoco")
+    mujoco = pytest.importorskip("palpate.drivers.mujoco", reason="palpate[sim] is not installed")
+    pytest.importorskip("mujoco", reason="palpate[sim] is not installed")
     driver = mujoco.MujocoDriver(ARM, payload=MASS, seed=1)
     with Session(ARM, driver, controller=controller(), simulated_time=True) as session:
         assert driver.state == "connected"

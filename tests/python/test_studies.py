@@ -381,7 +381,7 @@ def test_bounds_do_not_depend_on_the_seed(two_runs):
 
 
 def test_figures_of_the_payload_filter(two_runs, tmp_path):
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason="palpate[report] is not installed")
     runs = [f for group in two_runs.values() for f in group]
     figures = _figures.drawn(lambda: payload_filter._draw(runs, two_runs))
     assert len(figures) == 4
@@ -442,7 +442,7 @@ def test_jobs_and_results_travel(two_runs):
 
 @pytest.mark.parametrize("faulty", [False, True])
 def test_live_is_offline_is_replay_is_chunked(faulty):
-    pytest.importorskip("rosbags")
+    pytest.importorskip("rosbags", reason="palpate[logs] is not installed")
     found = replay.measure(replay.Job(faulty, 2.2))
     assert found.pipelines == 3 + len(OBSERVERS) * (1 + len(ESTIMATORS))
     assert len(found.ways) == 4

@@ -146,8 +146,8 @@ def test_keys_and_sticks_make_a_smooth_bounded_motion() -> None:
 
 # --- in MuJoCo --------------------------------------------------------------------------------------------------------
 
-pytest.importorskip("mujoco")
-pytest.importorskip("cryptography")
+pytest.importorskip("mujoco", reason="palpate[sim] is not installed")
+pytest.importorskip("cryptography", reason="palpate[teleop] is not installed")
 
 from palpate.teleop import scenes  # noqa: E402
 from palpate.teleop.channel import Faults  # noqa: E402
@@ -257,8 +257,8 @@ def test_scenes_and_arms_by_name() -> None:
 def test_the_command_writes_a_report_and_one_log_of_both_sides(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("matplotlib")
-    pytest.importorskip("rosbags")
+    pytest.importorskip("matplotlib", reason="palpate[report] is not installed")
+    pytest.importorskip("rosbags", reason="palpate[logs] is not installed")
     assert main(["teleop", "free", "--seconds", "1.5", "--out", str(tmp_path), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert any("bandwidth" in row["what"] for row in told["rows"])

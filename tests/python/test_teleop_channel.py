@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-pytest.importorskip("cryptography")
+pytest.importorskip("cryptography", reason="palpate[teleop] is not installed")
 
 from palpate.errors import InputError
 from palpate.teleop import ChannelError, Faults, FaultyLine, Message, Sealer, UdpChannel, make_key, read_key

@@ -139,6 +139,12 @@ def test_a_person_uses_the_page_and_returns_by_phone(tmp_path):
             assert len(Log.open(path)) > 0
             dismiss(page)
 
+            page.get_by_text("Estimators", exact=True).click()
+            set_value(page, "min change", 0.02)
+            page.get_by_role("button", name="Use these").click()
+            until(lambda: source.options(0)["payload"]["min_change"] == 0.02)
+            dismiss(page)
+
             field = (
                 page.locator("label:text-is('angles [rad]')")
                 .locator("xpath=ancestor::*[.//input][1]")

@@ -17,7 +17,7 @@ from palpate.logs import Signal
 MASS = 0.25
 
 
-def session(
+def trial(
     name: str = "justina_left_arm",
     *,
     pose: str | None = None,
@@ -27,7 +27,7 @@ def session(
     estimator: str | None = None,
     observer: str | None = None,
     **task: object,
-) -> W.Session:
+) -> W.Trial:
     scene = W.scene(W.load_arm(name), mass=mass)
     held = scene.mass if mass is None else mass
     plan = W.Task(
@@ -41,13 +41,13 @@ def session(
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[W.Session, Path]:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[W.Trial, Path]:
     path = tmp_path_factory.mktemp("weigh") / "run.mcap"
-    return session(record=path), path
+    return trial(record=path), path
 
 
 @pytest.fixture(scope="module")
-def log(recorded: tuple[W.Session, Path]) -> pp.Log:
+def log(recorded: tuple[W.Trial, Path]) -> pp.Log:
     return pp.Log.open(recorded[1], keep_invalid=True)
 
 
@@ -56,7 +56,7 @@ def log(recorded: tuple[W.Session, Path]) -> pp.Log:
 
 @pytest.mark.parametrize("pose", ["StandBy", "StandBy2", "Take", "Take2", "Take3", "Take4", "goal"])
 def test_weighs_a_quarter_kilogram_in_every_pose(pose: str) -> None:
-    result = W.weigh_session(session(pose=pose, seed=3), pose=pose)
+    result = W.weigh_trial(trial(pose=pose, seed=3), pose=pose)
     assert result.status == result.estimator_status == pp.Status.ok
     assert abs(result.error_percent) < 0.5
     assert abs(result.mass - MASS) < 4.0 * result.mass_std
@@ -66,7 +66,7 @@ def test_weighs_a_quarter_kilogram_in_every_pose(pose: str) -> None:
 
 @pytest.mark.parametrize("name", [n for n in pp.robots.names() if n != "abb_irb2400_16"])
 def test_every_reference_arm_weighs(name: str) -> None:
-    result = W.weigh_session(session(name))
+    result = W.weigh_trial(trial(name))
     assert result.status == pp.Status.ok
     assert abs(result.error_percent) < 2.0
     assert result.time_to_2_percent < 3.0
@@ -74,27 +74,27 @@ def test_every_reference_arm_weighs(name: str) -> None:
 
 
 def test_the_goal_is_reached_with_what_was_weighed() -> None:
-    assert W.weigh_session(session(pose="Take3", duration=6.0)).goal_error < 0.01
+    assert W.weigh_trial(trial(pose="Take3", duration=6.0)).goal_error < 0.01
 
 
 def test_the_same_seed_gives_the_same_run_and_another_does_not() -> None:
-    one, two, other = (session(seed=s, duration=1.0) for s in (4, 4, 5))
+    one, two, other = (trial(seed=s, duration=1.0) for s in (4, 4, 5))
     assert one.log == two.log
     assert np.array_equal(one.touch.payload.mass, two.touch.payload.mass)
     assert not np.array_equal(one.log.position, other.log.position)
 
 
 def test_without_noise_positions_are_exact() -> None:
-    ideal = session(noise=False, duration=1.0)
+    ideal = trial(noise=False, duration=1.0)
     assert np.array_equal(ideal.log.position, ideal.log.signals["true_position"].value)
-    noisy = session(duration=1.0)
+    noisy = trial(duration=1.0)
     off = np.abs(noisy.log.position - noisy.log.signals["true_position"].value)
     count = 2.0 * np.pi / 4096.0
     assert 2.0 * count < off.max() <= 2.5 * count + 1e-12
 
 
 def test_nothing_in_the_hand_weighs_nothing() -> None:
-    result = W.weigh_session(session(mass=0.0))
+    result = W.weigh_trial(trial(mass=0.0))
     assert result.status == pp.Status.ok
     assert abs(result.mass) < 2e-3
     assert np.isnan(result.error_percent) and np.isnan(result.time_to_2_percent)
@@ -115,7 +115,7 @@ def test_nothing_in_the_hand_weighs_nothing() -> None:
 )
 def test_a_load_held_from_the_start_is_never_ok_with_a_wrong_number(name: str, mass: float) -> None:
     for seed in (0, 1):
-        payload = session(name, mass=mass, loads=((0.0, mass),), duration=3.0, seed=seed).touch.payload
+        payload = trial(name, mass=mass, loads=((0.0, mass),), duration=3.0, seed=seed).touch.payload
         ok = payload.status == int(pp.Status.ok)
         error = np.abs(payload.mass - mass)[ok] / payload.mass_std[ok]
         assert np.count_nonzero(ok) > 300
@@ -126,7 +126,7 @@ def test_a_load_held_from_the_start_is_never_ok_with_a_wrong_number(name: str, m
 
 @pytest.mark.parametrize("pose", ["Take", "Take3", "goal"])
 def test_what_the_arm_cannot_lift_is_not_ok(pose: str) -> None:
-    result = W.weigh_session(session(mass=5.0, pose=pose, duration=8.0))
+    result = W.weigh_trial(trial(mass=5.0, pose=pose, duration=8.0))
     assert result.status == pp.Status.saturated
     assert "cannot lift" in result.remarks[0] and "la_1_joint, which has 2.5 N m" in result.remarks[0]
     if result.estimator_status == pp.Status.ok:
@@ -134,27 +134,27 @@ def test_what_the_arm_cannot_lift_is_not_ok(pose: str) -> None:
 
 
 def test_an_arm_that_stops_short_still_weighs() -> None:
-    result = W.weigh_session(session(pose="goal"))
+    result = W.weigh_trial(trial(pose="goal"))
     assert result.status == pp.Status.ok
     assert result.goal_error > 0.1
     assert "stops 0." in result.remarks[0] and "short of the pose: it takes" in result.remarks[0]
 
 
 def test_a_hanging_arm_says_where_to_weigh() -> None:
-    result = W.weigh_session(session(pose="Zero"))
+    result = W.weigh_trial(trial(pose="Zero"))
     assert result.status in (pp.Status.warming, pp.Status.singular)
     assert "hides the weight" in result.remarks[0] and "--pose Take3" in result.remarks[0]
 
 
 def test_goal_equal_to_start() -> None:
-    result = W.weigh_session(session(start="Take3", pose="Take3", duration=3.0))
+    result = W.weigh_trial(trial(start="Take3", pose="Take3", duration=3.0))
     assert result.status == pp.Status.ok and abs(result.error_percent) < 0.5
     assert result.time_to_2_percent < 1.0
     assert W.arrival(result.task) == 0.0
 
 
 def test_taken_and_dropped() -> None:
-    result = W.weigh_session(session(loads=((2.0, MASS), (6.0, 0.0)), start="Take3", duration=9.0))
+    result = W.weigh_trial(trial(loads=((2.0, MASS), (6.0, 0.0)), start="Take3", duration=9.0))
     assert result.change_times == pytest.approx([2.0, 6.0], abs=0.15)
     assert [h.mass for h in result.holds] == pytest.approx([0.0, MASS, 0.0], abs=0.003)
     assert [h.status for h in result.holds] == [pp.Status.ok] * 3
@@ -165,10 +165,10 @@ def test_taken_and_dropped() -> None:
 
 
 def test_other_estimators_see_the_same_motion() -> None:
-    filtered = session(duration=2.0)
-    formula = session(duration=2.0, estimator="joint-formula", observer="sliding-mode")
+    filtered = trial(duration=2.0)
+    formula = trial(duration=2.0, estimator="joint-formula", observer="sliding-mode")
     assert np.array_equal(filtered.log.position, formula.log.position)
-    regression = W.weigh_session(session(estimator="regression"))
+    regression = W.weigh_trial(trial(estimator="regression"))
     assert regression.status == pp.Status.ok and abs(regression.error_percent) < 6.0
 
 
@@ -184,13 +184,13 @@ def test_stopping_early_keeps_what_there_is(tmp_path: Path) -> None:
 
     found = W.run(task, W.make_pipeline(scene.arm)[0], record=tmp_path / "run.mcap", stop=stop)
     assert found.interrupted and len(found.log) == 500
-    result = W.weigh_session(found)
+    result = W.weigh_trial(found)
     assert result.remarks[0] == "Stopped after 2.00 of 10 s."
     log = pp.Log.open(tmp_path / "run.mcap", keep_invalid=True)
     assert len(log) == 500 and log.events[-1].kind == "stop"
     assert W.replay(log).same
     none = W.run(task, W.make_pipeline(scene.arm)[0], stop=lambda: True)
-    empty = W.weigh_session(none)
+    empty = W.weigh_trial(none)
     assert len(none.log) == 0 and empty.status == pp.Status.warming
     json.dumps(empty.summary(), allow_nan=False)
     empty.report()
@@ -220,13 +220,13 @@ def test_a_route_of_several_poses() -> None:
     found = W.run(task, W.make_pipeline(scene.arm)[0])
     assert np.array_equal(found.desired_q[round(2.5 * 250)], scene.poses["Take3"])
     assert np.array_equal(found.desired_q[-1], scene.poses["StandBy"])
-    assert W.weigh_session(found).goal_error < 0.02
+    assert W.weigh_trial(found).goal_error < 0.02
 
 
 # --- recorded -----------------------------------------------------------------------------------------------
 
 
-def test_a_recording_holds_everything(recorded: tuple[W.Session, Path], log: pp.Log) -> None:
+def test_a_recording_holds_everything(recorded: tuple[W.Trial, Path], log: pp.Log) -> None:
     found, _ = recorded
     assert np.array_equal(log.time_ns, found.log.time_ns) and log.time_ns[0] == 0
     assert np.array_equal(log.position, found.log.position)
@@ -255,7 +255,7 @@ def test_replay_is_bit_for_bit(log: pp.Log) -> None:
 @pytest.mark.parametrize("estimator, observer", [("regression", None), ("joint-formula", "sliding-mode")])
 def test_replay_of_other_estimators(estimator: str, observer: str | None, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    session(record=path, estimator=estimator, observer=observer, duration=1.0)
+    trial(record=path, estimator=estimator, observer=observer, duration=1.0)
     assert W.replay(pp.Log.open(path, keep_invalid=True)).same
 
 
@@ -299,12 +299,12 @@ def test_replay_wants_a_recording_of_palpate(log: pp.Log) -> None:
 # --- from a log ---------------------------------------------------------------------------------------------
 
 
-def test_a_log_weighs_what_the_live_run_weighed(recorded: tuple[W.Session, Path], log: pp.Log) -> None:
+def test_a_log_weighs_what_the_live_run_weighed(recorded: tuple[W.Trial, Path], log: pp.Log) -> None:
     found, _ = recorded
     result = W.weigh_log(log)
     assert np.array_equal(result.touch.payload.mass, found.touch.payload.mass)
     assert result.status == pp.Status.ok and result.true_mass == MASS
-    assert result.time_to_2_percent == W.weigh_session(found).time_to_2_percent
+    assert result.time_to_2_percent == W.weigh_trial(found).time_to_2_percent
     assert "recorded with" in result.remarks[0]
     summary = json.loads(json.dumps(result.summary(), allow_nan=False))
     assert summary["status"] == "ok" and summary["seed"] is None

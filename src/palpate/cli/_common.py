@@ -21,6 +21,34 @@ if TYPE_CHECKING:
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only the result.")]
+DEFAULT_ARM = "justina_left_arm"
+"""what is simulated where no arm is named"""
+RecordedLog = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="LOG",
+        help="A recording: .mcap, rosbag2 folder, .csv, .npz. Without it an arm is simulated.",
+        show_default=False,
+    ),
+]
+ArmOrRecorded = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ARM",
+        help=f"Name of a reference arm (see palpate arm), a card or a URDF. [default: {DEFAULT_ARM}, or "
+        "the one palpate recorded in LOG]",
+        show_default=False,
+    ),
+]
+Noise = Annotated[
+    bool, typer.Option("--noise/--no-noise", help="Noise and quantisation of the simulated drives.")
+]
+Seed = Annotated[
+    int,
+    typer.Option(
+        metavar="N", min=0, help="Of all that is drawn by chance; the same seed gives the same run."
+    ),
+]
 Columns = Annotated[
     str | None,
     typer.Option(
@@ -172,11 +200,26 @@ def is_text(content: bytes) -> bool:
     return b"palpate" in content
 
 
+def a_log(path: Path) -> Path:
+    """What is given as LOG, unless it is an arm.
+
+    Raises:
+        InputError: the name of a reference arm and no file, or a card or URDF.
+    """
+    from .. import robots
+
+    if (str(path) in robots.names() and not path.exists()) or path.suffix.lower() in (".urdf", ".xacro"):
+        raise InputError(
+            f"{path} is an arm, and a recording is expected here; an arm is given as --arm {path}"
+        )
+    return path
+
+
 def open_log(path: Path, columns: str | None) -> Log:
     """The log, bad rows kept: the pipeline gives them a status."""
     from ..logs import Log
 
-    return Log.open(path, column_map(columns), keep_invalid=True)
+    return Log.open(a_log(path), column_map(columns), keep_invalid=True)
 
 
 def column_map(text: str | None) -> ColumnMap | None:

@@ -13,7 +13,7 @@ from ..errors import InputError, suggest
 if TYPE_CHECKING:
     from ..arm import Arm
     from ..drivers import Driver
-    from ..weigh import Session
+    from ..weigh import Trial
 
 DriverName = Annotated[
     str | None,
@@ -168,13 +168,13 @@ def _number(port: str) -> int:
         raise InputError(f"--port of --driver fri is a UDP port such as 30200, got {port!r}") from None
 
 
-def line_summary(driver: Driver, session: Session) -> dict[str, Any]:
+def line_summary(driver: Driver, trial: Trial) -> dict[str, Any]:
     """Rate reached [Hz] and what happened on the line to the arm, plain values for JSON."""
     from ..drivers.fri import FriDriver
     from ..drivers.servos import ServoDriver
     from ..drivers.ur_rtde import UrDriver
 
-    log = session.log
+    log = trial.log
     rate = (len(log) - 1) / log.duration if len(log) > 1 else None
     found: dict[str, Any] = {"rate_hz": rate, "rate_asked_hz": 1e9 / driver.period_ns}
     if isinstance(driver, ServoDriver):

@@ -13,6 +13,7 @@ from ._common import (
     Json,
     Quiet,
     Repair,
+    Seed,
     Tip,
     check_target,
     console,
@@ -65,7 +66,7 @@ def run(
         float, typer.Option(metavar="S", help="How long it takes; it can be repeated.")
     ] = 20.0,
     harmonics: Annotated[int, typer.Option(metavar="N", help="Of the Fourier series.")] = 6,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of the search.")] = 0,
+    seed: Seed = 0,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Rows per second of the table.")] = 100.0,
     margin: Annotated[float, typer.Option(metavar="X", help="Part of every limit that is used.")] = 0.95,
     velocity: Annotated[

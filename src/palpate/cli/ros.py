@@ -44,12 +44,13 @@ def add(app: typer.Typer) -> None:
         help="Run one node until Ctrl-C.\n\n"
         "Remapping and parameters are given as to any ROS node: "
         "--ros-args -r old:=new -p name:=value --params-file FILE. NODE is one of arm_simulation, trajectory, control, "
-        "sliding_mode_observer, extended_kalman_filter, mass.",
+        "sliding_mode_observer, extended_kalman_filter, mass, wipe, camera.",
         epilog=examples(
             "palpate ros run mass --ros-args -p arm:=robot.arm.yaml -r joint_states:=/arm/joint_states",
             "palpate ros run mass --ros-args -p arm:=lbr.yaml -p state_kind:=lbr_state -r joint_states:=/lbr/state",
             "palpate ros run arm_simulation --ros-args -p payload_mass:=0.4 -r __ns:=/left",
             "palpate ros run control --domain 7 --ros-args --params-file gains.yaml",
+            "palpate ros run camera --ros-args -p latched:=false -r image/compressed:=/camera/image_raw/compressed",
         ),
     )(run)
     ros.command(
@@ -57,13 +58,14 @@ def add(app: typer.Typer) -> None:
         context_settings=_ARGUMENTS,
         help="Run the nodes of a graph, each in a process of its own, until Ctrl-C.\n\n"
         "GRAPH is mass-estimation: a simulated arm lifts an object, is observed and controlled, and tells its mass on "
-        "/payload_mass.",
+        "/payload_mass; or wiping: a simulated arm wipes a whiteboard, and a camera's node judges its pictures.",
         epilog=examples(
             "palpate ros launch mass-estimation",
             "palpate ros launch mass-estimation --ros-args -p arm_simulation:payload_mass:=0.4",
             "palpate ros launch mass-estimation --without arm_simulation --without trajectory --without control "
             "--ros-args -p arm:=robot.arm.yaml",
             "palpate ros launch mass-estimation --restart --ros-args --params-file tuning.yaml",
+            "palpate ros launch wiping --ros-args -p wipe:board:=3",
         ),
     )(launch)
     ros.command(
@@ -105,14 +107,14 @@ def run(
 ) -> int:
     """Run one node."""
     from ..ros import Context, RosArguments
-    from ..ros.tasks import TASKS
+    from ..ros.graphs import TASKS
 
     if node not in TASKS:
         raise InputError(f"no node {node!r}; {suggest(node, TASKS, 'there are')}")
     arguments = RosArguments.parse(context.args)
     with (
         _until_asked(parent) as stop,
-        Context(domain, localhost=localhost or None) as there,
+        Context(domain, localhost=localhost or None, largest=TASKS[node].largest) as there,
         TASKS[node](there, arguments, quiet=quiet) as task,
     ):
         task.log(f"{task.about}; domain {there.domain}")

@@ -10,10 +10,13 @@ import typer
 from ..errors import InputError
 from . import STOPPED
 from ._common import (
+    DEFAULT_ARM,
     Base,
     Json,
+    Noise,
     Quiet,
     Repair,
+    Seed,
     Tip,
     check_target,
     console,
@@ -54,7 +57,7 @@ def add(app: typer.Typer) -> None:
 def run(
     arm: Annotated[
         str, typer.Option(metavar="ARM", help="Name of a reference arm, a card or a URDF.")
-    ] = "justina_left_arm",
+    ] = DEFAULT_ARM,
     pose: Annotated[
         list[str] | None,
         typer.Option(
@@ -82,12 +85,10 @@ def run(
     ] = 3.0,
     hold: Annotated[float, typer.Option(metavar="S", help="Time at each pose but the last.")] = 2.0,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Samples per second.")] = 250.0,
-    noise: Annotated[
-        bool, typer.Option("--noise/--no-noise", help="Noise and quantisation of the drives.")
-    ] = True,
+    noise: Noise = True,
     jitter: Annotated[float, typer.Option(metavar="S", help="Error of the time stamps, up to.")] = 0.0,
     loss: Annotated[float, typer.Option(metavar="P", help="Probability that a sample is lost.")] = 0.0,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of noise, jitter and loss.")] = 0,
+    seed: Seed = 0,
     speed: Annotated[
         float | None,
         typer.Option(
@@ -142,7 +143,7 @@ def run(
     film = None if frames is None else _Film(make_folder(frames))
     pipeline, _ = weighing.make_pipeline(scene.arm)
     with interruptible() as stopped, _progress(task, json or quiet) as progress:
-        session = weighing.run(
+        trial = weighing.run(
             task,
             pipeline,
             record=out,
@@ -154,14 +155,14 @@ def run(
         )
     files = {"log": str(out)}
     if png is not None:
-        if session.picture is None:
-            raise InputError(f"--png: {session.picture_error}")
-        write_file(png, picture_png(session.picture))
+        if trial.picture is None:
+            raise InputError(f"--png: {trial.picture_error}")
+        write_file(png, picture_png(trial.picture))
         files["picture"] = str(png)
     if film is not None:
         files["frames"] = str(frames)
-    result = weighing.weigh_session(session)
-    log = session.log
+    result = weighing.weigh_trial(trial)
+    log = trial.log
     if json:
         emit(
             {
@@ -173,7 +174,7 @@ def run(
                 "frames": 0 if film is None else film.count,
                 "seed": seed,
                 "remarks": list(result.remarks),
-                "interrupted": session.interrupted,
+                "interrupted": trial.interrupted,
                 "files": files,
             }
         )
@@ -185,7 +186,7 @@ def run(
                 say(f"! {remark}")
         for name in files.values():
             say(name)
-    return STOPPED if session.interrupted else 0
+    return STOPPED if trial.interrupted else 0
 
 
 def _load(text: str) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from . import STOPPED
 from ._common import (
     Json,
     Quiet,
+    Seed,
     check_target,
     console,
     emit,
@@ -414,7 +415,7 @@ def run(
         float | None,
         typer.Option(metavar="S", help="How long. [default: as long as the scene takes]", show_default=False),
     ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of noise and faults.")] = 0,
+    seed: Seed = 0,
     out: Annotated[
         Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for report.html and teleop.mcap.")
     ] = Path("teleop"),

@@ -11,13 +11,19 @@ import typer
 
 from ..errors import InputError
 from ._common import (
+    DEFAULT_ARM,
+    ArmOrRecorded,
     Base,
     Columns,
     Effort,
     Json,
+    Noise,
     Quiet,
+    RecordedLog,
     Repair,
+    Seed,
     Tip,
+    a_log,
     emit,
     examples,
     make_folder,
@@ -32,8 +38,6 @@ if TYPE_CHECKING:
     from ..arm import Arm
     from ..drivers import Driver
     from ..view import Source
-
-_DEFAULT_ARM = "justina_left_arm"
 
 
 def add(app: typer.Typer) -> None:
@@ -58,23 +62,8 @@ def add(app: typer.Typer) -> None:
 
 
 def run(
-    log: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="LOG",
-            help="A recording: .mcap, rosbag2 folder, .csv, .npz. Without it an arm is simulated.",
-            show_default=False,
-        ),
-    ] = None,
-    arm: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ARM",
-            help=f"Name of a reference arm (see palpate arm), a card or a URDF. [default: {_DEFAULT_ARM}, or "
-            "the one palpate recorded in LOG]",
-            show_default=False,
-        ),
-    ] = None,
+    log: RecordedLog = None,
+    arm: ArmOrRecorded = None,
     mass: Annotated[
         float | None,
         typer.Option(
@@ -91,10 +80,8 @@ def run(
             show_default=False,
         ),
     ] = None,
-    noise: Annotated[
-        bool, typer.Option("--noise/--no-noise", help="Noise and quantisation of the simulated drives.")
-    ] = True,
-    seed: Annotated[int, typer.Option(metavar="N", help="Of the simulated noise.")] = 0,
+    noise: Noise = True,
+    seed: Seed = 0,
     driver: DriverName = None,
     port: Port = None,
     host: Host = None,
@@ -138,6 +125,7 @@ def run(
     from ._live import interruptible
 
     if log is not None:
+        a_log(log)
         only("a simulation", "LOG is a recording", {"--mass": mass, "--pose": pose})
         only("a live arm", "LOG is a recording", {"--driver": driver, "--rate": rate})
     else:
@@ -168,7 +156,7 @@ def run(
             hardware = make_driver(driver, model, port=port, bus=bus, host=host, rate=rate)
             source = _real(model, hardware, out)
     else:
-        model = open_arm(arm or _DEFAULT_ARM, base=base, tip=tip, repair=repair)
+        model = open_arm(arm or DEFAULT_ARM, base=base, tip=tip, repair=repair)
         source = _simulated(model, mass, pose, 250.0 if rate is None else rate, noise, seed, out)
     page = Page(source, host=host, port=number, title=source.arms[0].name, meshes=meshes)
     try:

@@ -11,13 +11,19 @@ import typer
 from ..errors import InputError
 from . import STOPPED
 from ._common import (
+    DEFAULT_ARM,
+    ArmOrRecorded,
     Base,
     Columns,
     Effort,
     Json,
+    Noise,
     Quiet,
+    RecordedLog,
     Repair,
+    Seed,
     Tip,
+    a_log,
     check_target,
     console,
     emit,
@@ -54,9 +60,7 @@ if TYPE_CHECKING:
     from ..arm import Arm
     from ..drivers import Driver
     from ..logs import Log
-    from ..weigh import Session, Task, Weighing
-
-_DEFAULT_ARM = "justina_left_arm"
+    from ..weigh import Task, Trial, Weighing
 
 
 def add(app: typer.Typer) -> None:
@@ -84,23 +88,8 @@ def add(app: typer.Typer) -> None:
 
 
 def run(
-    log: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="LOG",
-            help="A recording: .mcap, rosbag2 folder, .csv, .npz. Without it an arm is simulated.",
-            show_default=False,
-        ),
-    ] = None,
-    arm: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ARM",
-            help=f"Name of a reference arm (see palpate arm), a card or a URDF. [default: {_DEFAULT_ARM}, or "
-            "the one palpate recorded in LOG]",
-            show_default=False,
-        ),
-    ] = None,
+    log: RecordedLog = None,
+    arm: ArmOrRecorded = None,
     mass: Annotated[
         float | None,
         typer.Option(metavar="KG", help="Mass to lift. [default: 0.25 for Justina]", show_default=False),
@@ -135,13 +124,9 @@ def run(
             show_default=False,
         ),
     ] = None,
-    seed: Annotated[
-        int, typer.Option(metavar="N", help="Of the simulated noise; the same seed gives the same run.")
-    ] = 0,
+    seed: Seed = 0,
     duration: Annotated[float, typer.Option(metavar="S", help="How long to simulate.")] = 10.0,
-    noise: Annotated[
-        bool, typer.Option("--noise/--no-noise", help="Noise and quantisation of the drives.")
-    ] = True,
+    noise: Noise = True,
     speed: Annotated[
         float | None,
         typer.Option(
@@ -181,6 +166,7 @@ def run(
     from .. import weigh as weighing
 
     if log is not None:
+        a_log(log)
         given = {"--mass": mass, "--pose": pose, "--start": start, "--speed": speed, "--picture": picture}
         only("a simulation", "LOG is a recording", given)
         only("a real arm", "LOG is a recording", {"--driver": driver})
@@ -250,16 +236,16 @@ def run(
                 rate=1e9 / hardware.period_ns,
             )
             pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer)
-            session = _session(task, pipeline, target, live=live, pose=name, picture=False, driver=hardware)
-        result = weighing.weigh_session(session, pose=name)
-        on_bus = line_summary(hardware, session)
+            trial = _trial(task, pipeline, target, live=live, pose=name, picture=False, driver=hardware)
+        result = weighing.weigh_trial(trial, pose=name)
+        on_bus = line_summary(hardware, trial)
         if target is not None:
             files["log"] = str(target)
         title = f"What {scene.arm.name} holds"
     else:
         if mass is not None:
             weighing.check_mass(mass)
-        scene = weighing.scene(open_arm(arm or _DEFAULT_ARM, base=base, tip=tip, repair=repair), mass=mass)
+        scene = weighing.scene(open_arm(arm or DEFAULT_ARM, base=base, tip=tip, repair=repair), mass=mass)
         name, goal = weighing.find_pose(scene, pose or scene.pose)
         held = scene.mass if mass is None else mass
         task = weighing.Task(
@@ -274,18 +260,16 @@ def run(
         )
         pipeline, _ = weighing.make_pipeline(scene.arm, estimator, observer)
         target = _recording(out) if record else None
-        session = _session(
-            task, pipeline, target, live=live, pose=name, picture=report or picture is not None
-        )
-        result = weighing.weigh_session(session, pose=name)
+        trial = _trial(task, pipeline, target, live=live, pose=name, picture=report or picture is not None)
+        result = weighing.weigh_trial(trial, pose=name)
         if target is not None:
             files["log"] = str(target)
-        if session.picture is not None:
-            scene_png = picture_png(session.picture)
+        if trial.picture is not None:
+            scene_png = picture_png(trial.picture)
         elif picture is not None:
-            raise InputError(f"{picture} cannot be drawn: {session.picture_error or 'the run was stopped'}")
-        elif session.picture_error and not (json or quiet):
-            say(f"no picture: {session.picture_error}")
+            raise InputError(f"{picture} cannot be drawn: {trial.picture_error or 'the run was stopped'}")
+        elif trial.picture_error and not (json or quiet):
+            say(f"no picture: {trial.picture_error}")
         title = f"{scene.arm.name} weighs {held:g} kg"
     if report or picture is not None:
         from ..report import hero_picture, write_weigh_report
@@ -329,7 +313,7 @@ def _recording(out: Path) -> Path:
     return target
 
 
-def _session(
+def _trial(
     task: Task,
     pipeline: Any,
     target: Path | None,
@@ -338,15 +322,15 @@ def _session(
     pose: str,
     picture: bool,
     driver: Driver | None = None,
-) -> Session:
-    from ..weigh import run as run_session
+) -> Trial:
+    from ..weigh import run as run_trial
     from ._live import LiveTable, interruptible
 
     with interruptible() as stopped:
         if not live:
-            return run_session(task, pipeline, driver=driver, record=target, stop=stopped, picture=picture)
+            return run_trial(task, pipeline, driver=driver, record=target, stop=stopped, picture=picture)
         with LiveTable(task, pose) as table:
-            return run_session(
+            return run_trial(
                 task,
                 pipeline,
                 driver=driver,

@@ -17,6 +17,7 @@ from . import STOPPED
 from ._common import (
     Json,
     Quiet,
+    Seed,
     check_target,
     console,
     emit,
@@ -69,9 +70,7 @@ def add(app: typer.Typer) -> None:
 
 
 def run(
-    seed: Annotated[
-        int, typer.Option(metavar="N", help="Of board, light and noise; the same seed gives the same run.")
-    ] = 0,
+    seed: Seed = 0,
     ink: Annotated[
         Path | None,
         typer.Option(

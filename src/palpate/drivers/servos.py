@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import math
 import termios
 import time
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -24,6 +26,10 @@ _TRIES = 5
 """how often one servo is asked or told outside the control loop"""
 _ROUNDS = 3
 """how often all are told to switch off, as long as one has not confirmed it"""
+_SURE = 2
+"""how often a servo is asked alone before its silence counts"""
+_CALM = 50
+"""periods until a delay of the bus is forgotten"""
 _LATEST_NS = 10_000_000
 """a servo that answers so much later than the rest is of another moment [ns]: at 10 rad/s^2 it errs by 0.5 mrad"""
 
@@ -71,9 +77,15 @@ class ServoDriver(Driver):
     A period is one question to all servos and their answers, in the order of the bus. Answers that are damaged are
     thrown away and those servos asked once more, their positions taken back to the moment of the rest by their speeds;
     where one does not answer then, or too late for that, the sample is lost: read() returns None and
-    :attr:`statistics` counts it. A servo that stays silent for `patience` periods in a row is a
-    DriverError with its id, and the drives are stopped. The time of a sample is the middle between question and last
-    answer. Velocity is in the samples if the arm's card states its deviation for every joint; servos filter it.
+    :attr:`statistics` counts it. How long an answer is waited for follows from what the bus needed of late.
+
+    A servo is dead that leaves the question to all and two to itself without any answer while another servo answers a
+    later question: a bus keeps the order, so the line is well, and no delay of this computer looks like that. So is
+    one without a good answer for `patience` periods in a row. Either is a DriverError with its id, and the drives are
+    stopped.
+
+    The time of a sample is the middle between question and last answer. Velocity is in the samples if the arm's card
+    states its deviation for every joint; servos filter it.
 
     Args:
         arm: the arm.
@@ -135,6 +147,7 @@ class ServoDriver(Driver):
         self._statistics = BusStatistics()
         self._silent = dict.fromkeys(self._ids, 0)
         self._timed_out = self._unsettled = False
+        self._delay_ms = math.inf
         self._complaints.clear()
         self._doubts.clear()
 
@@ -175,6 +188,7 @@ class ServoDriver(Driver):
         try:
             self._find_servos()
             self._prepare()
+            self._most_gap_ms: float = self._port.gap_ms
             self._disable()
         except BaseException:
             self._close()
@@ -224,20 +238,17 @@ class ServoDriver(Driver):
         begin, behind = time.monotonic_ns(), 0
         with self._talking():
             self._everybody.txPacket()
+            self._hurry()
             found = self._collect(self._ids)
             middle = (begin + self._heard_ns) // 2
             self._unsettled = self._timed_out
+            if not self._timed_out:
+                self._learn_delay(1e-6 * (self._heard_ns - begin))
             self._hear_complaints(found)
             again = [i for i in self._ids if i not in found]
-            for servo in again:
-                self._packets.readTx(self._port, servo, *self._block)
-                for reading in self._collect([servo]).values():
-                    behind = self._heard_ns - middle
-                    found[servo] = reading.before(1e-9 * behind)
-                self._hear_complaints(found)
-                if servo not in found:
-                    self._unsettled = True
-                    self._count(unanswered=1)
+            if again:
+                found |= self._ask_again(again, sorted(found), middle)
+                behind = self._heard_ns - middle
             self._count(periods=1, repeated=len(again))
         for servo in self._ids:
             self._silent[servo] = 0 if servo in found else self._silent[servo] + 1
@@ -280,6 +291,55 @@ class ServoDriver(Driver):
         except (OSError, termios.error) as error:
             raise DriverError(f"{self._path}: the connection is gone: {_words(error)}") from None
 
+    def _learn_delay(self, took_ms: float) -> None:
+        """What the bus needs beyond the bytes' time on the wire: the longest of late."""
+        count = len(self._ids)
+        delay = took_ms - self._port.tx_time_per_byte * (14 + count + count * self._answer_length)
+        self._delay_ms = max(delay, min(self._delay_ms, self._port.grace_ms) * (1.0 - 1.0 / _CALM))
+        self._port.gap_ms = min(self._most_gap_ms, max(self._delay_ms, 0.5))
+
+    def _ask_again(self, again: Sequence[int], well: Sequence[int], middle: int) -> dict[int, Reading]:
+        """The servos that gave no good answer to the question to all, one by one; positions as of `middle` [ns].
+
+        Raises:
+            DriverError: one is dead.
+        """
+        found: dict[int, Reading] = {}
+        queue = deque(again)
+        out: list[int] = []  # asked, and not a byte heard since
+        patient = False
+        while queue:
+            servo = queue.popleft()
+            self._packets.readTx(self._port, servo, *self._block)
+            if not patient:
+                self._hurry()
+            out.append(servo)
+            answers = self._collect(out)
+            self._hear_complaints(answers)
+            found |= {i: r.before(1e-9 * (self._heard_ns - middle)) for i, r in answers.items()}
+            # what was damaged may have been anybody's answer
+            out = [i for i in out if i not in answers] if answers or self._timed_out else []
+            if servo not in answers:
+                self._unsettled = True
+                self._count(unanswered=1)
+                if 0 < out.count(servo) < _SURE:
+                    queue.appendleft(servo)
+            elif out:
+                dead = [s for s in self._servos if out.count(s.id) >= _SURE]
+                if dead:
+                    raise DriverError(
+                        f"{self._path}: {_names(dead)} did not answer {_SURE + 1} times, and then servo {servo} did"
+                    )
+                queue.extendleft(i for i in dict.fromkeys(out) if i not in queue)
+            if out and not queue and not patient:
+                patient = True
+                queue.extend([*well, *found][:1] or again)
+        return {i: reading for i, reading in found.items() if i in again}
+
+    def _hurry(self) -> None:
+        """Wait for the answer just asked for no longer than the bus needed of late."""
+        self._port.packet_timeout += min(max(1.25 * self._delay_ms, 1.0) - self._port.grace_ms, 0.0)
+
     def _collect(self, wanted: Sequence[int]) -> dict[int, Reading]:
         """The good answers to a question, by id. They come in the order of `wanted`: none follows the last one's."""
         found: dict[int, Reading] = {}
@@ -289,7 +349,9 @@ class ServoDriver(Driver):
             if result == self._sdk.COMM_RX_TIMEOUT:
                 self._timed_out = True
                 break
-            self._port.expect(left * self._answer_length)
+            self._port.expect(
+                min(left, 2) * self._answer_length
+            )  # the next one may be damaged, and be passed over
             servo, reading = -1, None
             if result == self._sdk.COMM_SUCCESS:
                 servo = packet[self._id_at]

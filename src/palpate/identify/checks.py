@@ -27,6 +27,8 @@ BLOCKS = 10
 """stretches of the data; every other one is kept out"""
 DOUBTFUL = 0.3
 """a joint whose unexplained torque is a larger part than this of the torque's own variation is looked into"""
+EXPLAINED = 0.1
+"""a joint with less than this unexplained is in its place: the torque of another joint would not be explained so"""
 BETTER = 1.5
 """natural logarithm of the unexplained torque, summed over the joints, by which undoing a mistake must lower it:
 recordings that are right stay below 0.8 for every mistake supposed"""
@@ -193,7 +195,7 @@ def _better_order(
     for _ in range(arm.n):
         at = best
         for a, b in combinations(range(arm.n), 2):
-            if tried[at][a] < DOUBTFUL and tried[at][b] < DOUBTFUL:
+            if max(tried[at][a], tried[at][b]) < DOUBTFUL or min(tried[at][a], tried[at][b]) < EXPLAINED:
                 continue
             swapped = list(at)
             swapped[a], swapped[b] = swapped[b], swapped[a]

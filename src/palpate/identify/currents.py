@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from palpate.arm import Array
 from palpate.errors import InputError, MissingExtraError
+from palpate.identify._threads import one_thread
 
 LEAST_AGREEMENT = 0.3
 """below it the currents do not turn with the position; where they do, glitches and offsets leave more [1]"""
@@ -49,6 +50,7 @@ class PhaseCalibration:
     agreement: float
 
 
+@one_thread
 def calibrate_phases(
     position: npt.ArrayLike, phase_a: npt.ArrayLike, phase_b: npt.ArrayLike, turns: float
 ) -> PhaseCalibration:
@@ -168,6 +170,7 @@ class TorqueConstants:
     seen: npt.NDArray[np.bool_]
 
 
+@one_thread
 def fit_torque_constants(
     torque: npt.ArrayLike, current: npt.ArrayLike, approach: npt.ArrayLike
 ) -> TorqueConstants:

@@ -17,6 +17,7 @@ import numpy as np
 
 from palpate.arm import Arm, Array
 from palpate.errors import ArmError, InputError, MissingExtraError
+from palpate.identify._threads import one_thread
 from palpate.identify.friction import FrictionModel
 from palpate.identify.regress import RANK, ROUNDING, parameters
 
@@ -200,6 +201,7 @@ class _Information:
         return float(np.mean(np.log(values))), float(np.sqrt(values[-1] / values[0]))
 
 
+@one_thread
 def excite(
     arm: Arm,
     *,

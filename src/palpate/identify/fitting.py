@@ -12,6 +12,7 @@ import numpy as np
 
 from palpate.arm import Arm, Array, Friction
 from palpate.errors import InputError, LogError
+from palpate.identify._threads import one_thread
 from palpate.identify.checks import check_columns, not_shown
 from palpate.identify.consistent import PRIOR, ConsistentSolution, body, consistent, prior_links
 from palpate.identify.data import Origin, RegressionData, Segment, prepare
@@ -273,6 +274,7 @@ class Fit:
         return "\n".join(lines)
 
 
+@one_thread
 def fit(
     arm: Arm,
     logs: Log | Sequence[Log],

@@ -23,6 +23,7 @@ import numpy as np
 
 from palpate.arm import Arm, Array, Effort
 from palpate.errors import InputError
+from palpate.identify._threads import one_thread
 from palpate.identify.consistent import link_parameters, prior_links
 from palpate.identify.data import prepare
 from palpate.identify.fitting import (
@@ -109,6 +110,7 @@ class GainFit:
     weakest: str
 
 
+@one_thread
 def fit_gains(
     arm: Arm,
     free: Log | Sequence[Log],

@@ -8,6 +8,7 @@ import numpy as np
 
 from palpate.arm import Array
 from palpate.errors import InputError, LogError
+from palpate.identify._threads import one_thread
 from palpate.identify.consistent import link_parameters
 from palpate.identify.data import prepare
 from palpate.identify.fitting import DRIFTING, Fit, check_joints, friction_size
@@ -46,6 +47,7 @@ class LoadEstimate:
     rows: int
 
 
+@one_thread
 def estimate_load(fit: Fit, log: Log, *, parameters: int = 10, drift: float | None = None) -> LoadEstimate:
     """Weigh what the arm carries in a log.
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from palpate.arm import Arm, Array
 from palpate.errors import InputError, LogError, MissingExtraError
+from palpate.identify._threads import one_thread
 from palpate.identify.data import LEAST_CUTOFF, RegressionData, Segment, prepare
 from palpate.identify.friction import remembered_sign
 from palpate.identify.regress import slowest
@@ -94,6 +95,7 @@ class BusDrive:
         return float(arm.joints[0].mass * (weighted @ torque) / (weighted @ expected))
 
 
+@one_thread
 def fit_bus_drive(arm: Arm, logs: Log | Sequence[Log], *, voltage: str = "voltage") -> BusDrive:
     """Find a = R/k_t^2, rotor inertia and friction of a servo from motion with a known load.
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from palpate.arm import Arm, Array
 from palpate.errors import InputError, MissingExtraError
+from palpate.identify._threads import one_thread
 from palpate.identify.data import RegressionData, prepare
 from palpate.identify.fitting import (
     LOAD_FRICTION_STD,
@@ -64,6 +65,7 @@ class TransmissionFit:
         return Residuals.of(tau[seen], torque[seen], "another log")
 
 
+@one_thread
 def fit_transmission(
     arm: Arm,
     logs: Log | Sequence[Log],

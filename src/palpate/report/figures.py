@@ -436,11 +436,11 @@ def joints_figure(
     rows = max(-(-n // columns), 1)
     with drawing():
         top = 0.32 if key else 0.02
-        wide, high = 3.4, 1.72
+        wide, high = 3.5, 1.72
         figure = _figure(columns * wide, rows * high + top)
         for joint, name in enumerate(joint_names):
             row, column = divmod(joint, columns)
-            ax = _axes(figure, column * wide + 0.58, (rows - 1 - row) * high + 0.4, wide - 0.66, high - 0.66)
+            ax = _axes(figure, column * wide + 0.74, (rows - 1 - row) * high + 0.4, wide - 0.82, high - 0.66)
             last = None
             _time_limits(ax, time)
             shown = [v[:, joint] for v in lines.values()]

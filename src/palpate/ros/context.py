@@ -25,7 +25,7 @@ from .messages import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo
 from .names import plain_type
 
 LARGEST = 64
-"""messages larger than this are dropped before they are put together [kB]"""
+"""messages larger than this are dropped before they are put together, unless told otherwise [kB]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +111,9 @@ def _local() -> bool:
     )
 
 
-def _configuration(localhost: bool) -> str:
+def _configuration(localhost: bool, largest: int) -> str:
     """For Cyclone DDS; ``CYCLONEDDS_URI`` comes behind and wins."""
-    own = f"<Internal><MaxSampleSize>{LARGEST} kB</MaxSampleSize></Internal>"
+    own = f"<Internal><MaxSampleSize>{largest} kB</MaxSampleSize></Internal>"
     if localhost:
         own += (
             '<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
@@ -142,15 +142,18 @@ class Context:
     Args:
         domain: its number; None: ``ROS_DOMAIN_ID``, or 0.
         localhost: stay on this machine; None: as ``ROS_LOCALHOST_ONLY`` or ``ROS_AUTOMATIC_DISCOVERY_RANGE`` say.
+        largest: messages larger than this are dropped before they are put together [kB].
 
     Raises:
-        InputError: no such domain, or this process has it open with another `localhost`.
+        InputError: no such domain, or this process has it open with another `localhost` or `largest`.
     """
 
-    def __init__(self, domain: int | None = None, *, localhost: bool | None = None) -> None:
+    def __init__(
+        self, domain: int | None = None, *, localhost: bool | None = None, largest: int = LARGEST
+    ) -> None:
         self.domain = default_domain() if domain is None else check_domain(domain)
         self.localhost = _local() if localhost is None else localhost
-        text = _configuration(self.localhost)
+        text = _configuration(self.localhost, largest)
         shared = _domains.get(self.domain)
         if shared is None:
             try:

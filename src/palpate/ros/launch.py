@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 
 from ..errors import InputError, suggest
-from .tasks import GRAPHS, TASKS
+from .graphs import GRAPHS, TASKS
 
 _PATIENCE = 5.0
 """for a process to end after it was asked to [s]"""
@@ -41,8 +41,8 @@ def graph(name: str, without: Sequence[str] = ()) -> tuple[str, ...]:
 class Launch:
     """Processes of nodes, each ``palpate ros run NODE``.
 
-    Where the simulated arm is among them, it waits for the others, and all take what its description leaves open as it
-    does; when it has done its ``duration``, all are stopped.
+    Where ``arm_simulation`` is among them, it waits for the others, and all take what its description leaves open as it
+    does; when it has done its ``duration``, or ``wipe`` its job, all are stopped.
 
     Args:
         nodes: names of tasks.
@@ -94,7 +94,7 @@ class Launch:
         )
 
     def watch(self, stop: Callable[[], bool] = lambda: False) -> int:
-        """Keep an eye on them until `stop()`, until the simulated arm is done, or until one fails; then stop all.
+        """Keep an eye on them until `stop()`, until a simulated arm is done, or until one fails; then stop all.
 
         Returns:
             0, or the exit code of the node that failed.
@@ -105,7 +105,7 @@ class Launch:
                     code = process.poll()
                     if code is None:
                         continue
-                    if name == "arm_simulation" and code == 0:
+                    if TASKS[name].simulated and code == 0:
                         self._say(f"{name} is done")
                         return 0
                     how = f"ended by signal {-code}" if code < 0 else f"ended with exit code {code}"

@@ -155,6 +155,15 @@ class JointState(IdlStruct, typename="sensor_msgs.msg.dds_.JointState_"):
     effort: Doubles = field(default_factory=list)
 
 
+@_message("RIHS01_15640771531571185e2efc8a100baf923961a4d15d5569652e6cb6691e8e371a")
+class CompressedImage(IdlStruct, typename="sensor_msgs.msg.dds_.CompressedImage_"):
+    """``sensor_msgs/msg/CompressedImage``."""
+
+    header: Header = field(default_factory=Header)
+    format: str = ""
+    data: Bytes = field(default_factory=list)
+
+
 @_message("RIHS01_cc12fe83e4c02719f1ce8070bfd14aecd40f75a96696a67a2a1f37f7dbb0765d")
 class Vector3(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
     """``geometry_msgs/msg/Vector3``."""

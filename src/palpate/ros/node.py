@@ -91,6 +91,7 @@ class Subscription:
         how: Reliability,
         callback: Callable[[Any, int], None],
         attach: Callable[[Any], None],
+        optional: bool = False,
     ) -> None:
         self.name = name
         """full name"""
@@ -98,7 +99,7 @@ class Subscription:
         self.malformed = 0
         """messages whose bytes were not of this type"""
         self._context, self._how, self._attach = context, how, attach
-        self._callback = callback
+        self._callback, self._optional = callback, optional
         self._malformed, self._complain_until, self._reason = 0, 0.0, ""
         self._open()
 
@@ -154,7 +155,7 @@ class Subscription:
             return ""
         if others:
             return f"{self.name} is published as {', '.join(others)}; expected {self._type}"
-        if time.monotonic() - self._since < _ALONE:
+        if time.monotonic() - self._since < _ALONE or (self._optional and not known):
             return ""
         if known:
             nodes = ", ".join(sorted({p.node or "an unnamed node" for p in known}))
@@ -279,14 +280,18 @@ class Node:
         topic: str,
         callback: Callable[[Any, int], None],
         how: Reliability = STREAM,
+        *,
+        optional: bool = False,
     ) -> Subscription:
         """Have `callback` called with every message and a number for its writer, within :meth:`spin_once`.
+
+        optional: nothing is wrong where nobody publishes it.
 
         Raises:
             InputError: the topic's name is none.
         """
         name = self.resolve(topic)
-        made = Subscription(self.context, message, name, how, callback, self._waitset.attach)
+        made = Subscription(self.context, message, name, how, callback, self._waitset.attach, optional)
         self._subscriptions.append(made)
         self.context.announce()
         return made

@@ -25,7 +25,7 @@ from ..pipeline import ESTIMATORS, OBSERVERS, Pipeline, Touch
 from ..weigh import Scene, Task, brick, check_mass, find_pose, load_arm, scene, simulated_driver
 from ..weigh.scenes import gains_at, parse_effort
 from .arguments import RosArguments
-from .context import Context
+from .context import LARGEST, Context
 from .messages import (
     Float64,
     Header,
@@ -72,7 +72,9 @@ class TaskNode(Node):
     reads_samples = False
     """whether it reads joint_states"""
     simulated = False
-    """whether the arm is"""
+    """whether the arm is; a launch ends where it does"""
+    largest = LARGEST
+    """of its messages [kB]"""
 
     def __init__(
         self, context: Context, arguments: RosArguments | None = None, *, quiet: bool = False
@@ -86,6 +88,14 @@ class TaskNode(Node):
             raise
 
     def _begin(self) -> None:
+        self._choose_arm()
+        self._prepare()
+        for remark in self.parameters.check_overrides():
+            self.log(remark, level=30)
+        self.parameters.on_set(self._consider)
+
+    def _choose_arm(self) -> None:
+        """Declare which arm it is about, and load it."""
         self.arm_name: str = self._declare(
             "arm", "justina_left_arm", "name of a reference arm, a card or a URDF", fixed=True
         )
@@ -107,10 +117,6 @@ class TaskNode(Node):
         self.arm: Arm = self.scene.arm if assume else arm
         for sentence in self.scene.assumed if assume else ():
             self.log(sentence)
-        self._prepare()
-        for remark in self.parameters.check_overrides():
-            self.log(remark, level=30)
-        self.parameters.on_set(self._consider)
 
     def _declare(self, name: str, default: Any, meaning: str, *, fixed: bool = False) -> Any:
         return self.parameters.declare(name, default, meaning, read_only=fixed)
@@ -320,7 +326,7 @@ class Trajectory(TaskNode):
         self._began = 0
         self._message: JointTrajectory | None = None
         self._out = self.publish(JointTrajectory, "setpoint")
-        self.subscribe(JointState, "goal", self._take)
+        self.subscribe(JointState, "goal", self._take, optional=True)
         self.read_samples(self._step, self._forget)
 
     def _consider(self, values: Mapping[str, Any]) -> None:
@@ -636,12 +642,3 @@ class Mass(Estimator):
         )
         self.fact("mass", mass)
         return [(self._mass, Float64(mass)), (self._std, Float64(std)), (self._payload, stamped)]
-
-
-TASKS: Mapping[str, type[TaskNode]] = {
-    node.task: node
-    for node in (ArmSimulation, Trajectory, Control, SlidingModeObserver, ExtendedKalmanFilter, Mass)
-}
-"""every node by name"""
-GRAPHS: Mapping[str, tuple[str, ...]] = {"mass-estimation": tuple(TASKS)}
-"""nodes that are launched together, by name"""

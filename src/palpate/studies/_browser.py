@@ -105,7 +105,9 @@ def pictures(page: Page) -> int:
 
 def dismiss(page: Page) -> None:
     """Close the messages that lie over the picture, such as viser's about a processor that draws."""
+    # by the page's own hand: one that closes by itself meanwhile is not waited for
+    close = "all => all.forEach(button => button.click())"
     buttons = page.locator(".mantine-Notification-closeButton")
     while buttons.count():
-        buttons.first.click()
+        buttons.evaluate_all(close)
         page.wait_for_timeout(300.0)

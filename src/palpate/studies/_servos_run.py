@@ -15,6 +15,7 @@ from ..drivers.bus import Bus, Servo
 from ..drivers.dynamixel import DynamixelDriver
 from ..errors import DriverError
 from ._peers import peer
+from ._timed import priority
 
 MASS = 0.25
 _CONSTANT = 1.78
@@ -23,6 +24,7 @@ _CONSTANT = 1.78
 
 def measure(seconds: float, corrupt: float, dead: int) -> dict[str, Any]:
     """Seven emulated Dynamixels at 1 Mbps with 0.5 ms USB delay lift 0.25 kg; servo `dead` dies 1 s later (0: none)."""
+    fifo = priority()
     emulator = peer("servo_bus")
     arm = robots.load("justina_left_arm")
     spec = {
@@ -52,8 +54,8 @@ def measure(seconds: float, corrupt: float, dead: int) -> dict[str, Any]:
             )
             pipeline, _ = weigh.make_pipeline(place.arm)
             try:
-                session = weigh.run(task, pipeline, driver=driver)
-                log, payload = session.log, session.touch.payload
+                trial = weigh.run(task, pipeline, driver=driver)
+                log, payload = trial.log, trial.touch.payload
                 ok = payload.status == int(Status.ok)
                 error = np.abs(payload.mass - MASS)
                 found |= {
@@ -70,6 +72,7 @@ def measure(seconds: float, corrupt: float, dead: int) -> dict[str, Any]:
         out, _ = process.communicate(timeout=30)
     return {
         **found,
+        "fifo": fifo,
         **json.loads(out),
         "periods": statistics.periods,
         "lost": statistics.lost,

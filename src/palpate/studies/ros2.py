@@ -23,11 +23,11 @@ import numpy as np
 
 from ..errors import InputError, PalpateError
 from ..ros import Context, Node, Reliability
+from ..ros.graphs import GRAPHS, TASKS
 from ..ros.launch import Launch, graph
 from ..ros.messages import Header, InertiaStamped, JointState, JointTrajectory, Time
-from ..ros.tasks import TASKS
 from ..weigh import Task, load_arm, make_pipeline, scene
-from ..weigh import run as run_session
+from ..weigh import run as run_trial
 from . import Progress, Row
 from ._rows import at_most, told
 from .speed import source_tree
@@ -227,10 +227,10 @@ def stream_rows(name: str, found: Stream, rate: float, seconds: float) -> list[R
 
 
 def weigh_by_graph(domain: int, seconds: float, seed: int) -> tuple[float, float]:
-    """Mass [kg] that the launched graph tells last, and that of a session in this process."""
+    """Mass [kg] that the launched graph tells last, and that of a trial in this process."""
     arm = scene(load_arm("justina_left_arm"))
     masses: list[float] = []
-    readers = 1 + sum(node.reads_samples for node in TASKS.values())
+    readers = 1 + sum(TASKS[node].reads_samples for node in GRAPHS["mass-estimation"])
     with Context(domain, localhost=True) as there, Node("palpate_bench", there, quiet=True) as node:
         node.subscribe(JointState, "joint_states", lambda m, w: None)
         node.subscribe(InertiaStamped, "payload", lambda m, w: masses.append(m.inertia.m))
@@ -253,8 +253,8 @@ def weigh_by_graph(domain: int, seconds: float, seed: int) -> tuple[float, float
         duration=seconds,
         seed=seed,
     )
-    session = run_session(task, make_pipeline(arm.arm, None, None)[0])
-    return masses[-1] if masses else math.nan, float(session.touch.payload.mass[-1])
+    trial = run_trial(task, make_pipeline(arm.arm, None, None)[0])
+    return masses[-1] if masses else math.nan, float(trial.touch.payload.mass[-1])
 
 
 _ANSWERS = {

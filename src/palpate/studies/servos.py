@@ -68,11 +68,12 @@ def run(
         rows.append(near(what, 0, found["wrong"], 0, "1", judged=enough))
     found = _run({"seconds": 10.0, "corrupt": 0.0, "dead": DEAD}, progress)
     cycles = found["off_s"] / found["period"]
-    what = f"servo {DEAD} dies: cycles until the others are off"
+    what = f"servo {DEAD} dies: cycles from its first missing answer until the others push nothing"
     rows.append(at_most(what, _CYCLES, cycles, "1", found["words"], judged=enough))
     notes = [
         "The maker's SDK over a pseudo-terminal; the emulated servos run in a process of their own, in real time, and "
-        "move by the MuJoCo plant. No real servo was at hand. No process had real-time priority: the kernel passes the "
-        "terminal's bytes on without it too, so a busy computer shows here.",
+        "move by the MuJoCo plant. No real servo was at hand. "
+        + _timed.priority_words(found["fifo"])
+        + " The kernel passes the terminal's bytes on without it, so a busy computer shows here.",
     ]
     return rows, {}, notes

@@ -18,6 +18,7 @@ from ..errors import InputError, MissingExtraError, PalpateError
 from ..pipeline import ESTIMATORS, OBSERVERS
 from ..report._style import LIGHT
 from ..report._text import escape, number
+from ._guard import guarded
 from .scene import (
     Badge,
     Channels,
@@ -124,7 +125,7 @@ class Page:
     ) -> None:
         viser = _viser()
         check_address(host, port)
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets with a table of its own
+        with contextlib.redirect_stdout(io.StringIO()), guarded(host):  # it greets with a table of its own
             self._server: ViserServer = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         if port not in (0, self._server.get_port()):
             self._server.stop()
@@ -649,11 +650,18 @@ class _ArmNodes:
         reach = shown.arm.reach
         R = shown.placement
         self._scene.add_frame(root, show_axes=False, wxyz=_wxyz(R[:3, :3]), position=R[:3, 3])
-        self._frames = [
-            self._scene.add_frame(f"{root}/link{i}", show_axes=False) for i in range(shown.arm.n + 1)
-        ]
-        self._shapes: list[list[tuple[Any, tuple[int, int, int]]]] = [[] for _ in self._frames]
-        for link, handle, colour in _drawn(self._scene, root, shown.arm, meshes):
+        # each link within the one before: a motion is one message per joint
+        places = [root]
+        self._frames = []
+        for joint in shown.arm.joints:
+            places.append(f"{places[-1]}/{len(places)}")
+            T = joint.T_parent_joint
+            self._frames.append(
+                self._scene.add_frame(places[-1], show_axes=False, wxyz=_wxyz(T[:3, :3]), position=T[:3, 3])
+            )
+        self._fixed = [_wxyz(joint.T_parent_joint[:3, :3]).tolist() for joint in shown.arm.joints]
+        self._shapes: list[list[tuple[Any, tuple[int, int, int]]]] = [[] for _ in places]
+        for link, handle, colour in _drawn(self._scene, places, shown.arm, meshes):
             self._shapes[link + 1].append((handle, colour))
         self._lit = (-1, -1)
         self._q = np.full(shown.arm.n, np.nan)
@@ -693,7 +701,7 @@ class _ArmNodes:
         grasp = np.append(shown.arm.grasp, 1.0)
         at = shown.arm.T_last_tip @ grasp
         self._object = self._scene.add_box(
-            f"{root}/link{shown.arm.n}/object",
+            f"{places[-1]}/object",
             color=_OBJECT,
             dimensions=(1.0, 1.0, 1.0),
             opacity=0.85,
@@ -713,11 +721,12 @@ class _ArmNodes:
 
     def update(self, reading: Reading) -> None:
         """Show this reading."""
-        if not np.allclose(reading.touch.q, self._q, rtol=0.0, atol=1e-5, equal_nan=False):
-            self._q = np.array(reading.touch.q)
-            frames = link_frames(self.shown.arm, np.nan_to_num(self._q))
-            for handle, T in zip(self._frames, frames, strict=True):
-                handle.wxyz, handle.position = _wxyz(T[:3, :3]), T[:3, 3]
+        q = np.asarray(reading.touch.q)
+        if not (np.abs(q - self._q) <= 1e-5).all():
+            self._q = q.copy()
+            known = np.nan_to_num(q)
+            self._bend(known.tolist())
+            frames = link_frames(self.shown.arm, known)
             hand = (
                 self.shown.placement
                 @ frames[-1]
@@ -732,6 +741,17 @@ class _ArmNodes:
         if self._label.text != text:
             self._label.text = text
         self._show_object(float(reading.touch.payload.mass) if weight.badge.tone == "green" else 0.0)
+
+    def _bend(self, q: list[float]) -> None:
+        """Turn or shift every joint to its angle."""
+        for joint, handle, fixed, angle in zip(
+            self.shown.arm.joints, self._frames, self._fixed, q, strict=True
+        ):
+            if joint.kind == "revolute":
+                handle.wxyz = _turned(fixed, joint.axis.tolist(), angle)
+            else:
+                T = joint.T_parent_joint
+                handle.position = T[:3, 3] + T[:3, :3] @ (angle * joint.axis)
 
     def _light(self, lit: tuple[int, int]) -> None:
         if lit == self._lit:
@@ -780,8 +800,10 @@ class _ArmNodes:
             self._object.scale = side or 1.0
 
 
-def _drawn(scene: Any, root: str, arm: Arm, meshes: bool) -> Iterator[tuple[int, Any, tuple[int, int, int]]]:
-    """Link, handle and colour of everything that is drawn of an arm."""
+def _drawn(
+    scene: Any, places: list[str], arm: Arm, meshes: bool
+) -> Iterator[tuple[int, Any, tuple[int, int, int]]]:
+    """Link, handle and colour of everything that is drawn of an arm; places: of the base and of every link."""
     seen = set()
     if meshes:
         for k, shape in enumerate(s for s in arm.shapes if s.kind == "mesh"):
@@ -791,12 +813,12 @@ def _drawn(scene: Any, root: str, arm: Arm, meshes: bool) -> Iterator[tuple[int,
             seen.add(shape.link)
             colour = _rgb(shape.rgba)
             place = {"wxyz": _wxyz(shape.T[:3, :3]), "position": shape.T[:3, 3], "scale": tuple(shape.size)}
-            name = f"{root}/link{shape.link + 1}/mesh{k}"
+            name = f"{places[shape.link + 1]}/mesh{k}"
             yield shape.link, scene.add_mesh_simple(name, mesh[0], mesh[1], color=colour, **place), colour
     for k, shape in enumerate(arm.solid_shapes()):
         if shape.link in seen:
             continue
-        name = f"{root}/link{shape.link + 1}/shape{k}"
+        name = f"{places[shape.link + 1]}/shape{k}"
         colour = _rgb(shape.rgba)
         place = {"wxyz": _wxyz(shape.T[:3, :3]), "position": shape.T[:3, 3], "color": colour}
         if shape.kind == "box":
@@ -838,6 +860,19 @@ def _wxyz(R: Array) -> Array:
     import viser.transforms as tf
 
     return np.asarray(tf.SO3.from_matrix(R).wxyz)
+
+
+def _turned(wxyz: list[float], axis: list[float], angle: float) -> tuple[float, float, float, float]:
+    """The quaternion `wxyz`, then a turn by `angle` [rad] about the unit vector `axis` in its axes."""
+    w, x, y, z = wxyz
+    c, s = math.cos(0.5 * angle), math.sin(0.5 * angle)
+    a, b, d = s * axis[0], s * axis[1], s * axis[2]
+    return (
+        w * c - x * a - y * b - z * d,
+        w * a + x * c + y * d - z * b,
+        w * b - x * d + y * c + z * a,
+        w * d + x * b - y * a + z * c,
+    )
 
 
 def _cone(sides: int) -> tuple[Array, Any]:

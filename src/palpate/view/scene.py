@@ -342,7 +342,7 @@ class Channels:
         if reading.powered:
             mass, half = float(payload.mass), TWO_SIDED_95 * float(payload.mass_std)
             row[4 * n :] = mass, mass - half, mass + half, math.nan, reading.true_mass
-            if mass_badge(reading).tone == "green":
+            if int(payload.status) == int(Status.ok) and mass_badge(reading).tone == "green":
                 row[4 * n + 3] = mass
         return row
 

@@ -6,12 +6,12 @@ from .hardware import driven_arm, present_pose
 from .proposal import TwoWayMotion, two_way_motion
 from .replay import Difference, Replay, replay
 from .scenes import Scene, find_pose, load_arm, parse_effort, scene, telling_pose, weight_torque
-from .session import (
+from .trial import (
     Moment,
     Route,
     RouteControl,
-    Session,
     Task,
+    Trial,
     arm_of,
     arrival,
     brick,
@@ -22,7 +22,7 @@ from .session import (
     simulated_driver,
     truth_of,
 )
-from .weighing import Hold, Weighing, fit_joints, fit_log, make_pipeline, refused, weigh_log, weigh_session
+from .weighing import Hold, Weighing, fit_joints, fit_log, make_pipeline, refused, weigh_log, weigh_trial
 
 __all__ = [
     "Difference",
@@ -32,8 +32,8 @@ __all__ = [
     "Route",
     "RouteControl",
     "Scene",
-    "Session",
     "Task",
+    "Trial",
     "TwoWayMotion",
     "Weighing",
     "arm_of",
@@ -59,6 +59,6 @@ __all__ = [
     "truth_of",
     "two_way_motion",
     "weigh_log",
-    "weigh_session",
+    "weigh_trial",
     "weight_torque",
 ]

@@ -13,7 +13,7 @@ from ..arm import Arm
 from ..errors import LogError
 from ..logs import Log
 from ..pipeline import Pipeline, Touch
-from .session import arm_of
+from .trial import arm_of
 
 
 @dataclass(frozen=True, slots=True)

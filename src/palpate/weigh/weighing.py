@@ -19,7 +19,7 @@ from ..pipeline import ESTIMATORS, OBSERVERS, Pipeline, Touch
 from .noise import describe_noise
 from .proposal import TwoWayMotion, stiction_std, two_way_motion
 from .scenes import Scene, telling_pose, weight_torque
-from .session import Session, Task, arm_of, arrival
+from .trial import Task, Trial, arm_of, arrival
 
 if TYPE_CHECKING:
     from ..report import WeighReport
@@ -369,49 +369,49 @@ def _known(what: str, name: str | None, choices: tuple[str, ...]) -> None:
         raise InputError(f"no {what} {name!r}; {suggest(name, choices, 'there are')}")
 
 
-def weigh_session(session: Session, *, pose: str = "", scene: Scene | None = None) -> Weighing:
-    """What a session weighed."""
-    task = session.task
+def weigh_trial(trial: Trial, *, pose: str = "", scene: Scene | None = None) -> Weighing:
+    """What a trial weighed."""
+    task = trial.task
     scene = scene or task.scene
-    arm, log = task.scene.arm, session.log
+    arm, log = task.scene.arm, trial.log
     remarks = list(task.scene.assumed)
-    status = Status(int(session.touch.payload.status[-1])) if len(log) else Status.warming
+    status = Status(int(trial.touch.payload.status[-1])) if len(log) else Status.warming
     goal_error = math.nan
     if len(log):
-        goal_error, held_back = _arrived(session)
+        goal_error, held_back = _arrived(trial)
         if held_back:
             remarks.insert(0, held_back[1])
             if held_back[0] and status == Status.ok:
                 status = Status.saturated
-    if session.interrupted:
+    if trial.interrupted:
         remarks.insert(0, f"Stopped after {log.duration:.2f} of {task.duration:g} s.")
     result = Weighing(
         arm=arm,
-        pipeline=session.pipeline,
+        pipeline=trial.pipeline,
         log=log,
-        touch=session.touch,
+        touch=trial.touch,
         status=status,
         truth=_truth(log, task.loads) if task.simulated else (np.empty(0), np.empty(0)),
         task=task,
         pose=pose,
-        desired=(session.desired_q, session.desired_dq),
+        desired=(trial.desired_q, trial.desired_dq),
         goal_error=goal_error,
-        interrupted=session.interrupted,
+        interrupted=trial.interrupted,
     )
     return replace(result, remarks=(*_why(result, scene), *remarks))
 
 
-def _arrived(session: Session) -> tuple[float, tuple[bool, str] | None]:
+def _arrived(trial: Trial) -> tuple[float, tuple[bool, str] | None]:
     """Largest distance of a joint from the goal [rad]; if torque limits hold it back: whether it fails, in words."""
-    task, log = session.task, session.log
+    task, log = trial.task, trial.log
     arm, goal = task.scene.arm, task.poses[-1]
     at = log.signals["true_position"].value if task.simulated else log.position
     error = float(np.max(np.abs(at[-1] - goal)))
     last = log.seconds > log.seconds[-1] - 1.0
-    held_back = np.mean(session.control[last] == int(Status.saturated)) > 0.5
+    held_back = np.mean(trial.control[last] == int(Status.saturated)) > 0.5
     if log.seconds[-1] < arrival(task) or error < 0.02 or not held_back:
         return error, None
-    mass = max(float(session.touch.payload.mass[-1]), 0.0)
+    mass = max(float(trial.touch.payload.mass[-1]), 0.0)
     needed = np.abs(arm.gravity_torque(goal) - mass * (arm.gravity @ arm.jacobian(goal, arm.grasp)[:3]))
     limits = np.array([j.limits.effort for j in arm.joints])
     worst = int(np.argmax(needed / limits))

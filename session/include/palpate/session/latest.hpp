@@ -16,17 +16,26 @@ class Latest {
 
   /// Writer: replaces what was not read yet.
   void write(const T& value) noexcept {
-    slots_[back_] = value;
-    back_ = middle_.exchange(static_cast<std::uint8_t>(back_ | fresh), std::memory_order_acq_rel) & slot;
+    draft() = value;
+    publish();
   }
+  /// Writer: the same in two steps, the new value written in its place.
+  [[nodiscard]] T& draft() noexcept { return slots_[back_]; }
+  void publish() noexcept { back_ = middle_.exchange(static_cast<std::uint8_t>(back_ | fresh), std::memory_order_acq_rel) & slot; }
 
   /// Reader: the newest value; false if it is the one of the last read().
   bool read(T& out) noexcept {
-    const bool newer = (middle_.load(std::memory_order_relaxed) & fresh) != 0;
-    if (newer) front_ = middle_.exchange(front_, std::memory_order_acq_rel) & slot;
-    out = slots_[front_];
+    const bool newer = renew();
+    out = newest();
     return newer;
   }
+  /// Reader: the same in two steps, the value read in its place.
+  bool renew() noexcept {
+    const bool newer = (middle_.load(std::memory_order_relaxed) & fresh) != 0;
+    if (newer) front_ = middle_.exchange(front_, std::memory_order_acq_rel) & slot;
+    return newer;
+  }
+  [[nodiscard]] const T& newest() const noexcept { return slots_[front_]; }
 
  private:
   static constexpr std::uint8_t slot = 3, fresh = 4;

@@ -1,11 +1,13 @@
 // ControlLoop: one tick after the other, by whoever's thread it is: read, estimate, control, limit, write, record.
 #pragma once
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
+#include <cstring>
 #include <memory>
 #include <stdexcept>
 #include <string>
@@ -19,35 +21,10 @@
 #include "palpate/session/driver.hpp"
 #include "palpate/session/histogram.hpp"
 #include "palpate/session/latest.hpp"
+#include "palpate/session/record.hpp"
 #include "palpate/session/ring.hpp"
 
 namespace palpate {
-
-enum class Mode : std::uint8_t {
-  watching = 0,  ///< the arm is read, its drives are off
-  enabled = 1,   ///< the controller moves it
-  stopped = 2,   ///< over, on request or at the end of a recording
-  fault = 3,     ///< over, because of what ControlLoop::fault() says
-};
-
-/// Everything about one tick that brought a sample.
-struct Record {
-  std::uint64_t tick = 0;         ///< number of the tick, from 0; those lost count too
-  Mode mode = Mode::watching;     ///< during the tick
-  RawSample raw{};
-  Touch touch{};
-  Setpoint setpoint{};            ///< read only if commanded
-  JointVector wanted{};           ///< torque before the safety limiter [N m]; read only if commanded
-  JointVector sent{};             ///< torque that went out [N m]; read only if commanded
-  Status control = Status::held;  ///< of the command: ok, saturated, ...; held: there is none
-  std::uint8_t limited = 0;       ///< Limited bits
-  bool commanded = false;         ///< a command was sent for this sample
-  double tare = 0.0;              ///< mass that is called zero [kg]
-  double tare_std = 0.0;          ///< its standard deviation [kg]
-  std::uint64_t tares = 0;        ///< number of the request for that tare, see Request::tare; 0: none yet
-  std::int64_t late_ns = 0;       ///< by how much the tick began late [ns]
-  std::int64_t read_ns = 0, step_ns = 0, write_ns = 0;  ///< what it spent in the driver, in estimating and controlling, in the driver again [ns]
-};
 
 struct LoopConfig {
   PipelineConfig pipeline{};
@@ -103,8 +80,9 @@ class ControlLoop {
         config_(config),
         pipeline_(arm_, config.pipeline),
         limiter_(limiter),
-        ring_(config.records),
-        black_box_(config.black_box),
+        format_(arm_->n(), config.pipeline.wrench.has_value(), config.pipeline.contact.has_value()),
+        ring_(std::max(config.records, config.black_box), format_.bytes()),
+        spilled_(config.black_box),
         period_(driver_->period_ns()),
         patience_(nanoseconds(check::positive("LoopConfig patience [s]", config.patience))),
         lease_(nanoseconds(check::not_negative("LoopConfig lease [s]", config.lease))) {
@@ -133,8 +111,8 @@ class ControlLoop {
     r.control = Status::held;
     r.limited = 0;
     const Reading reading = driver_->read(r.raw);
-    const std::int64_t arrived = clock_->now();
     const std::int64_t processor = clock_->thread_time();
+    const std::int64_t arrived = clock_->now();
     const std::size_t allocated = allocations();
     r.late_ns = std::max<std::int64_t>(0, (driver_->paced() ? arrived : wake) - due_);
     account(r.late_ns);
@@ -142,7 +120,7 @@ class ControlLoop {
     if (reading == Reading::fault) return fail(driver_->complaint());
     if (reading == Reading::finished) return finish(Mode::stopped);
 
-    box_.read(request_);
+    if (box_.renew()) request_ = box_.newest();
     watch(arrived);
     bool usable = false;
     JointVector torque{};
@@ -202,9 +180,21 @@ class ControlLoop {
   /// A sign of life, see LoopConfig::lease. Wait-free.
   void renew() noexcept { signs_.fetch_add(1, std::memory_order_relaxed); }
   /// The newest record; false: it is the one of before. Wait-free.
-  bool read_state(Record& out) noexcept { return state_.read(out); }
+  bool read_state(Record& out) noexcept {
+    const bool newer = state_.renew();
+    if (!seen_ && !newer) return false;
+    seen_ = true;
+    format_.unpack(state_.newest().data(), out);
+    return newer;
+  }
   /// The oldest record that was not taken yet. Wait-free.
-  bool take(Record& out) noexcept { return ring_.take(out); }
+  bool take(Record& out) noexcept {
+    const std::byte* packed = ring_.front();
+    if (packed == nullptr) return false;
+    format_.unpack(packed, out);
+    ring_.pop();
+    return true;
+  }
   /// How many of the drives' switchings on or off are done, see Request::enabled.
   [[nodiscard]] std::uint64_t switched() const noexcept { return switched_.load(std::memory_order_acquire); }
 
@@ -226,9 +216,15 @@ class ControlLoop {
   /// The newest records, oldest first. Only when the loop is over and its thread has left tick(); else none.
   [[nodiscard]] std::vector<Record> black_box() const {
     std::vector<Record> out;
-    if (!over() || black_box_.empty()) return out;
-    const std::uint64_t kept = std::min<std::uint64_t>(boxed_, black_box_.size());
-    for (std::uint64_t i = boxed_ - kept; i < boxed_; ++i) out.push_back(black_box_[i % black_box_.size()]);
+    if (!over()) return out;
+    for (std::size_t age = 0; age < config_.black_box; ++age) {
+      const std::byte* packed = ring_.back(age);
+      if (packed == nullptr) break;
+      format_.unpack(packed, out.emplace_back());
+    }
+    out.insert(out.end(), spilled_.begin(), spilled_.begin() + static_cast<std::ptrdiff_t>(std::min<std::uint64_t>(spills_, spilled_.size())));
+    std::sort(out.begin(), out.end(), [](const Record& a, const Record& b) { return a.tick < b.tick; });
+    if (out.size() > config_.black_box) out.erase(out.begin(), out.end() - static_cast<std::ptrdiff_t>(config_.black_box));
     return out;
   }
 
@@ -293,9 +289,15 @@ class ControlLoop {
   }
 
   void publish(const Record& r) noexcept {
-    ring_.push(r);
-    state_.write(r);
-    if (!black_box_.empty()) black_box_[boxed_++ % black_box_.size()] = r;
+    const std::byte* const packed = state_.draft().data();
+    const std::size_t size = format_.pack(r, state_.draft().data());
+    if (std::byte* slot = ring_.draft()) {
+      std::memcpy(slot, packed, size);
+      ring_.push();
+    } else if (!spilled_.empty()) {
+      spilled_[spills_++ % spilled_.size()] = r;
+    }
+    state_.publish();
   }
 
   /// Drives on or off, as requested. Switching on waits for a usable sample, may take long, and starts the time anew.
@@ -338,10 +340,11 @@ class ControlLoop {
   LoopConfig config_;
   Pipeline pipeline_;
   SafetyLimiter limiter_;
-  Ring<Record> ring_;
-  Latest<Record> state_;
+  RecordFormat format_;
+  Ring ring_;  // to the owner; what was taken stays for black_box() until its place is used again
+  Latest<std::array<std::byte, sizeof(Record)>> state_;
   Latest<Request> box_;
-  std::vector<Record> black_box_;
+  std::vector<Record> spilled_;  // the newest that did not fit into the ring
   std::int64_t period_, patience_, lease_;  // [ns]
   LoopStatistics statistics_;
   std::atomic<bool> stop_{false};
@@ -352,12 +355,14 @@ class ControlLoop {
   // the ticking thread's own
   Record record_{};
   Request request_{};
-  std::uint64_t tick_ = 0, signs_seen_ = 0, boxed_ = 0;
+  std::uint64_t tick_ = 0, signs_seen_ = 0, spills_ = 0;
   std::int64_t due_ = 0;                               // when the next tick should begin [ns]
   std::int64_t good_ = 0, heard_ = 0;                  // last usable sample, last sign of life [ns]
   std::int64_t end_ = 0, own_ = 0, driver_time_ = 0, own_processor_ = 0;  // of the tick before [ns]
   std::int64_t sample_ns_ = 0;
   bool sampled_ = false;
+
+  bool seen_ = false;  // by the owner: there is a state
 };
 
 }  // namespace palpate

@@ -120,7 +120,7 @@ def _within(what: str, value: float, above: float, most: float, unit: str) -> No
 
 
 class Moment(NamedTuple):
-    """How far a session is."""
+    """How far a trial is."""
 
     time: float
     """[s]"""
@@ -133,8 +133,8 @@ class Moment(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Session:
-    """What a session left: N samples of n joints."""
+class Trial:
+    """What a trial left: N samples of n joints."""
 
     task: Task
     pipeline: Mapping[str, Any]
@@ -351,7 +351,7 @@ def run(
     picture: bool = False,
     frames: Callable[[npt.NDArray[np.uint8]], None] | None = None,
     frame_rate: float = 25.0,
-) -> Session:
+) -> Trial:
     """Let an arm do a task; each of its samples goes through the pipeline.
 
     The controller is fed the state and the load of the pipeline's payload filter, or of one of its own where the
@@ -363,7 +363,7 @@ def run(
         driver: of a real arm, where the task's loads are None; it is closed at the end, the drives off.
         record: file (.mcap) or folder to record every input and output to; it is replaced.
         progress: called every PROGRESS_S of the arm's time.
-        stop: asked before every period; True stops the arm and ends the session, the record included.
+        stop: asked before every period; True stops the arm and ends the trial, the record included.
         picture: draw the arm as it stands at the end.
         frames: called with a picture (720, 960, 3), `frame_rate` times per simulated second.
         frame_rate: [Hz].
@@ -452,7 +452,7 @@ def run(
     finally:
         if recorder is not None:
             recorder.close()
-    return rows.session(task, pipeline, interrupted, drawn, error)
+    return rows.result(task, pipeline, interrupted, drawn, error)
 
 
 def _over(task: Task, time: float, touch: Touch) -> bool:
@@ -467,7 +467,7 @@ def truth_of(plant: Plant) -> tuple[Array, Array, float]:
 
 
 class _Rows:
-    """Collects a session row by row."""
+    """Collects a trial row by row."""
 
     def __init__(self, n: int) -> None:
         self._n = n
@@ -481,14 +481,14 @@ class _Rows:
         if truth is not None:
             self._truth.append(truth)
 
-    def session(
+    def result(
         self,
         task: Task,
         pipeline: Pipeline,
         interrupted: bool,
         picture: npt.NDArray[np.uint8] | None,
         error: str,
-    ) -> Session:
+    ) -> Trial:
         n, moments = self._n, self._moments
         touches = [m.touch for m in moments]
 
@@ -533,7 +533,7 @@ class _Rows:
                 codes([t.payload.status for t in touches]),
             ),
         )
-        return Session(
+        return Trial(
             task=task,
             pipeline=pipeline.options(),
             log=log,
