@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,17 @@ def test_a_motor_model_is_a_file_and_says_what_is_wrong_with_it() -> None:
         identified("kuka_lbr_iiwa7")
     with pytest.raises(InputError, match=r"expected effort of shape \(6, 2\)"):
         MotorForce(truth_arm(), model).step(Sample(0, POSE, None, np.zeros(6)))
+
+
+@pytest.mark.slow
+def test_the_stored_model_is_what_identification_finds() -> None:
+    script = Path(__file__).parents[2] / "scripts" / "identify_irb2400.py"
+    found, stored = runpy.run_path(str(script))["model"](), identified()
+    for name in ("coulomb", "viscous", "rotor", "gain", "angle_offset", "sensor_gain"):
+        np.testing.assert_allclose(getattr(found, name), getattr(stored, name), rtol=0.02, atol=0.02)
+    arm = truth_arm()
+    Y = arm.regressor(POSE[None], np.zeros((1, 6)), np.ones((1, 6)))[0]
+    np.testing.assert_allclose(Y @ found.phi, Y @ stored.phi, atol=2.0)
 
 
 def test_the_abb_follows_and_nothing_false_is_felt() -> None:

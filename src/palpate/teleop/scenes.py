@@ -341,7 +341,7 @@ def slave_arm(name: str) -> SlaveArm:
                 "load friction of the SO-101's gears as measured on the 7.4 V servo; its current is good to a step of "
                 "6.5 mA",
             ),
-            gain=40.0,
+            gain=60.0,
             threshold=5.0,
             masses=(0.1, 0.2),
             kind="servos",

@@ -35,7 +35,7 @@ CURRENT_STEP = 6.5e-3
 """of the current that it reports [A]"""
 LOAD_FRICTION = 0.2116
 """part of the load its gears lose (Rhoban/bam, feetech_sts3215_7_4V, m3) [1]"""
-BANDWIDTH = 35.0
+BANDWIDTH = 50.0
 """of the follower's position control [rad/s]: encoders of 12 bit allow no more"""
 STIFFENING = 6.0
 """bandwidth with which the external torque is taken off [rad/s]"""
@@ -47,7 +47,7 @@ CERTAIN, GONE = 64.0, 16.0
 """a touch is certain where the sum of the joints' (torque/std)^2 is above the one, until it is below the other [1]"""
 TURNING = 0.05
 """speed from which on the sign of friction is known: the encoder has turned a few counts lately [rad/s]"""
-VELOCITY = 120.0
+VELOCITY = 200.0
 """low-pass of positions before velocities are taken [rad/s]"""
 
 
