@@ -22,6 +22,7 @@ from ..teleop.ends import PERIOD
 from ..teleop.scenes import smooth
 from ..teleop.session import Run, Wish
 from ..teleop.setups import Setup
+from ._guard import guarded
 from .page import _STYLE, _drawn, _no_share, _viser, _wxyz, check_address
 from .scene import link_frames
 
@@ -97,7 +98,7 @@ class TeleopPage:
     ) -> None:
         viser = _viser()
         check_address(host, port)
-        with contextlib.redirect_stdout(io.StringIO()):  # it greets with a table of its own
+        with contextlib.redirect_stdout(io.StringIO()), guarded(host):  # it greets with a table of its own
             self._server: ViserServer = viser.ViserServer(
                 host=host, port=port, label="palpate teleop", verbose=False
             )
@@ -125,8 +126,9 @@ class TeleopPage:
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         server.scene.configure_default_lights(enabled=True, cast_shadow=False)
         server.scene.add_grid("/floor", width=4.0, height=4.0, cell_size=0.1, section_size=0.5)
-        self._frames = [server.scene.add_frame(f"/slave/link{i}", show_axes=False) for i in range(arm.n + 1)]
-        self._shapes = [handle for _, handle, _ in _drawn(server.scene, "/slave", arm, False)]
+        places = [f"/slave/link{i}" for i in range(arm.n + 1)]
+        self._frames = [server.scene.add_frame(place, show_axes=False) for place in places]
+        self._shapes = [handle for _, handle, _ in _drawn(server.scene, places, arm, False)]
         self._tip = np.array(self._setup.slave.x)
         self._device = self._tip + _ASIDE
         server.scene.add_box(
