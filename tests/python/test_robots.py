@@ -26,7 +26,7 @@ def test_names():
         for f in resources.files("palpate.robots").iterdir()
         if f.name.endswith(".urdf")
     }
-    assert files == set(robots.names()) and len(robots.names()) == 7
+    assert files == set(robots.names()) and len(robots.names()) == 8
     assert robots.load("kuka_lbr_iiwa7") is robots.load("kuka_lbr_iiwa7")
     with pytest.raises(ArmError, match="no reference arm 'kuka_iiwa7'; did you mean 'kuka_lbr_iiwa7'"):
         robots.load("kuka_iiwa7")

@@ -9,21 +9,22 @@ from palpate import Effort, InputError
 from palpate.identify import FrictionModel, fit, prepare
 from palpate.identify.friction import remembered_sign
 from palpate.logs import Log
+from palpate.simulate import irb2400
+from palpate.simulate.irb2400 import B
 from palpate.studies import _irb2400, _irb2400_force, _pulley_rig
 from palpate.studies._geared_arm import RATE, Run, simulate
-from palpate.studies._irb2400 import B
 
 pytest.importorskip("scipy", reason="palpate[identify] is not installed")
 
 
 @pytest.fixture(scope="module")
 def arm():
-    return _irb2400.truth_arm()
+    return irb2400.truth_arm()
 
 
 @pytest.fixture(scope="module")
 def drives(arm):
-    return _irb2400.truth_drives(arm)
+    return irb2400.truth_drives(arm)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +66,7 @@ def test_the_robot_follows_and_friction_stays_within_its_bounds(drives, motions)
     reference = _irb2400.excitation(1, 16.0, 0.3)(motions[0].time)
     assert np.abs(motions[0].q - reference).max() < 5e-3
     w = motions[0].dq @ B.T
-    bound = (1.0 + _irb2400.RIPPLE) * drives.static + drives.viscous * np.abs(w)
+    bound = (1.0 + irb2400.RIPPLE) * drives.static + drives.viscous * np.abs(w)
     assert np.all(np.abs(motions[0].friction) < 1.1 * bound + 1.0)
     fast = np.abs(w) > 0.1
     assert np.all((motions[0].friction * w)[fast] > 0.0)
@@ -146,7 +147,7 @@ def test_a_level_is_followed_over_the_same_distance():
 def test_glitches_follow_reversals_only():
     speed = np.r_[np.full(100, 0.1), np.zeros(50), np.full(100, 0.1), np.full(100, -0.1)][:, None]
     w = _irb2400.glitches(speed)[:, 0]
-    assert np.flatnonzero(w).min() == 250 and np.flatnonzero(w).max() < 250 + round(_irb2400.GLITCH * RATE)
+    assert np.flatnonzero(w).min() == 250 and np.flatnonzero(w).max() < 250 + round(irb2400.GLITCH * RATE)
     assert 0.0 <= w.min() and w.max() <= 1.0
 
 

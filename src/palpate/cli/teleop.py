@@ -80,11 +80,20 @@ _Scene = Annotated[
     typer.Argument(metavar="[SCENE]", help="wall, rigid, surface, peg, lift or free.", show_default=False),
 ]
 _Arm = Annotated[
-    str, typer.Option("--arm", metavar="ARM", help="The slave: kuka_lbr_iiwa14 or kuka_lbr_iiwa7.")
+    str,
+    typer.Option(
+        "--arm", metavar="ARM", help="The slave: kuka_lbr_iiwa14, kuka_lbr_iiwa7, abb_irb2400_16 or so101."
+    ),
 ]
 _Stiffness = Annotated[float, typer.Option("--stiffness", metavar="N/M", help="Of the wall.")]
 _MotionScale = Annotated[
-    float, typer.Option("--motion-scale", metavar="S", help="Motion of the arm per motion of the hand.")
+    float | None,
+    typer.Option(
+        "--motion-scale",
+        metavar="S",
+        help="Motion of the arm per motion of the hand. [default: what suits the arm]",
+        show_default=False,
+    ),
 ]
 _ForceScale = Annotated[
     float | None,
@@ -213,7 +222,7 @@ def slave(
     arm: _Arm = "kuka_lbr_iiwa14",
     coupling: _Coupling = "force_position",
     stiffness: _Stiffness = 2000.0,
-    motion_scale: _MotionScale = 1.0,
+    motion_scale: _MotionScale = None,
     force_scale: _ForceScale = None,
     passivity: _Passivity = True,
     delay: _Delay = 0.0,
@@ -383,11 +392,11 @@ def run(
         list[float] | None,
         typer.Option(
             metavar="KG",
-            help="Object to lift; again for the next one. [default: 0.5 1.2]",
+            help="Object to lift; again for the next one. [default: what suits the arm]",
             show_default=False,
         ),
     ] = None,
-    motion_scale: _MotionScale = 1.0,
+    motion_scale: _MotionScale = None,
     force_scale: _ForceScale = None,
     delay: _Delay = 0.0,
     jitter: _Jitter = 0.0,
@@ -442,7 +451,7 @@ def run(
         coupling=chosen,
         stiffness=stiffness,
         press=press,
-        masses=tuple(mass or (0.5, 1.2)),
+        masses=tuple(mass) if mass else None,
         motion_scale=motion_scale,
         force_scale=force_scale,
         passive=passivity,
@@ -464,7 +473,7 @@ def run(
         "arm": arm,
         "coupling": coupling,
         "passivity layer": "on" if passivity else "off",
-        "motion scale": motion_scale,
+        "motion scale": setup.motion_scale,
         "force scale": setup.follower.force_scale,
         "delay, jitter [s]": f"{delay:g}, {jitter:g}",
         "loss, duplicates": f"{loss:g}, {duplicate:g}",
@@ -499,12 +508,16 @@ def run(
 
 def _page(setup: Setup, faults: Faults | None, listen: str, stack: ExitStack, seconds: float | None) -> Tap:
     """A live page of what runs, closed with the stack; its tap."""
+    from ..teleop.masters import HapticDevice
     from ..view.teleop import Person, TeleopPage
     from .view import address
 
     host, port = address(listen)
-    person = Person(setup.device.hand.wish, setup.seconds)
-    setup.device.hand = replace(setup.device.hand, wish=person)
+    device = setup.device
+    if not isinstance(device, HapticDevice):
+        raise InputError("--view shows a haptic device and its arm; a leader arm and its twin have no page")
+    person = Person(device.hand.wish, setup.seconds)
+    device.hand = replace(device.hand, wish=person)
     page = TeleopPage(setup, person=person, faults=faults, host=host, port=port)
     stack.callback(page.close)
     say(f"{page.url}   Ctrl-C ends, and so do {seconds or VIEW_S:g} s")

@@ -19,6 +19,7 @@ _NAMES = (
     "katana_450_6m90a",
     "kuka_lbr_iiwa14",
     "kuka_lbr_iiwa7",
+    "so101",
 )
 
 

@@ -1,15 +1,8 @@
 """A stiffly controlled industrial arm with geared drives: truth for the sensorless-force study.
 
 Forward dynamics of the chain with friction that sticks, slides and remembers (LuGre), at the motors, which may
-turn with
-several joints:
-
-    M q'' + C q' + g + B^T (I_m B q'' + f) = B^T tau_m + J^T F,        motor speeds w = B q'
-    dz/dt = w - |w| z / x(w),   x = x_0 g(w)/F_c,   g = F_c + (F_s - F_c) exp(-(w/v_s)^2)
-    f = (F_c/x_0) z + s_1 dz/dt + F_v w
-
-C. Canudas de Wit, H. Olsson, K. Astrom, P. Lischinsky, IEEE TAC 40(3), 1995. What identification fits is
-another model (Dahl's remembered sign times a Stribeck curve), so no fit can be exact.
+turn with several joints: :mod:`palpate.simulate.drives`. What identification fits is another model (Dahl's
+remembered sign times a Stribeck curve), so no fit can be exact.
 """
 
 from __future__ import annotations
@@ -20,37 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arm import Arm, Array
+from ..simulate.drives import Drives, LuGre, position_gains
 
 RATE = 1000
 """control steps and readings per second [Hz]"""
 SUBSTEPS = 2
 """integration steps per control step"""
-BANDWIDTH = 60.0
-"""of the position control [rad/s]"""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Drives:
-    """The motors of an arm, all seen at the link side.
-
-    Attributes:
-        B: (n, n) motor speeds = B dq.
-        inertia: (n,) of the rotors [kg m^2].
-        coulomb, static, viscous, stribeck_velocity: (n,) F_c, F_s [N m], F_v [N m s/rad], v_s [rad/s].
-        presliding: (n,) x_0 [rad].
-        ripple: (n,) part of the Coulomb friction that varies with the motor's position [1].
-        ripple_period: (n,) of that variation [rad].
-    """
-
-    B: Array
-    inertia: Array
-    coulomb: Array
-    static: Array
-    viscous: Array
-    stribeck_velocity: Array
-    presliding: Array
-    ripple: Array
-    ripple_period: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,12 +76,6 @@ def simulate(runs: Sequence[Run], progress: Callable[[float], None] = lambda don
     K, n = len(runs), runs[0].arm.n
     B, inverse_B = runs[0].drives.B, np.linalg.inv(runs[0].drives.B)
 
-    def of_drives(name: str) -> Array:
-        return np.array([getattr(run.drives, name) for run in runs])
-
-    coulomb, static, viscous = of_drives("coulomb"), of_drives("static"), of_drives("viscous")
-    stribeck, presliding = of_drives("stribeck_velocity"), of_drives("presliding")
-    ripple, wave = of_drives("ripple"), 2.0 * np.pi / of_drives("ripple_period")
     rotors = np.array([B.T @ np.diag(run.drives.inertia) @ B for run in runs])
     q_d = np.stack([run.reference(time) for run in runs], axis=1)
     dq_d = np.gradient(q_d, h, axis=0)
@@ -129,12 +91,9 @@ def simulate(runs: Sequence[Run], progress: Callable[[float], None] = lambda don
         # the inertia each motor sees in the middle of its motion sets its gains
         middle = round(0.5 * run.seconds * RATE)
         seen[k] = np.diag(inverse_B.T @ (run.arm.mass_matrix(q_d[middle, k]) + rotors[k]) @ inverse_B)
-    # the speed loop must outdo the falling branch of the Stribeck curve, or the joint creeps by jerks
-    kp, kd = seen * BANDWIDTH**2, 2.0 * seen * BANDWIDTH + 1.5 * (static - coulomb) / stribeck
-    ki = kp * BANDWIDTH / 4.0
-    stiffness = coulomb / presliding
-    micro = 0.2 * np.sqrt(stiffness * seen)
-    q, dq, z = q_d[0].copy(), np.zeros((K, n)), np.zeros((K, n))
+    motors = Drives.stacked([run.drives for run in runs])
+    kp, kd, ki = position_gains(motors, seen)
+    friction_of, q, dq = LuGre(motors, seen), q_d[0].copy(), np.zeros((K, n))
     integral, friction = np.zeros((K, n)), np.zeros((K, n))
     rows = np.empty((4, count, K, n))
     M, push, zero, tip = np.empty((K, n, n)), np.empty((K, n)), np.zeros((K, n)), np.zeros(3)
@@ -149,16 +108,10 @@ def simulate(runs: Sequence[Run], progress: Callable[[float], None] = lambda don
             J = core.jacobian(here, tip)
             push[at] = np.einsum("kij,ki->kj", J, F[k, at]) - core.inverse_dynamics(here, dq[at], zero[at])
         inverse = np.linalg.inv(M + rotors)
-        uneven = 1.0 + ripple * np.sin(wave * (q @ BT))
+        uneven = friction_of.uneven(q @ BT)
         rows[0, k], rows[1, k] = q, dq
         for _ in range(SUBSTEPS):
-            w = dq @ BT
-            g = coulomb + (static - coulomb) * np.exp(-np.square(w / stribeck))
-            reach = presliding * g / coulomb
-            end = np.sign(w) * reach
-            moved = end + (z - end) * np.exp(-np.abs(w) * dt / reach)
-            friction = uneven * (stiffness * moved + micro * (moved - z) / dt) + viscous * w
-            z = moved
+            friction = friction_of.step(dq @ BT, uneven, dt)
             dq = dq + dt * (inverse @ ((tau - friction) @ B + push)[:, :, None])[:, :, 0]
             q = q + dt * dq
         rows[2, k], rows[3, k] = tau, friction

@@ -10,9 +10,9 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from .. import robots
 from ..arm import Arm, Array, Effort
-from ._geared_arm import RATE, Drives, Motion
+from ..simulate.irb2400 import ENCODER, TURNING, B, CurrentSensors, glitch_pulse
+from ._geared_arm import RATE, Motion
 
 # --- the paper's experiment -------------------------------------------------------------------------------------------
 
@@ -27,31 +27,6 @@ POSITION_RATE = 50
 PAPER_CUTOFF = 30.0
 """of the low-passes that take the steps out of it; assumed [rad/s]"""
 
-B = np.eye(6)
-B[2, 1] = 1.0
-"""speeds of the motors = B dq: the parallelogram turns motor 3 with joints 2 and 3"""
-
-# --- what no source states: typical of such robots, the same for both methods -----------------------------------------
-
-K_T = np.array([1.2, 1.2, 1.1, 0.8, 0.8, 0.8])
-"""torque constants per ampere of peak current [N m/A]"""
-GEAR = np.array([125.0, 125.0, 110.0, 60.0, 60.0, 50.0])
-POLE_PAIRS = 4
-ROTORS = np.array([10.0, 10.0, 10.0, 2.5, 2.5, 1.5])
-"""inertia of the rotors at the link side [kg m^2]"""
-PRESLIDING = 5e-4
-"""[rad]; lies between the distances that identification tries"""
-RIPPLE = 0.02
-"""of the friction with the motor's position, which no model here knows, part of Coulomb friction [1]"""
-ENCODER = 1.5e-5
-"""one count at the link [rad]"""
-NOMINAL = np.array([3.0, 5.0, 3.0, 3.0, 3.0, 3.0])
-"""of the current sensors TH3A and TH5A [A]"""
-OFFSET, GAIN_MISMATCH, NOISE = 0.02, 0.02, 0.005
-"""offset, gain error and noise of a sensor: largest, largest, standard deviation; part of nominal, of reading,
-of nominal [1]"""
-GLITCH = 0.04
-"""how long the change of the phase order leaves no sine when a motor turns back [s]"""
 CURRENT_RATE = 20.0
 """no motor here changes its current faster: 60 N m of friction turned over in 20 ms [A/s]"""
 SHEET_STD = 0.05
@@ -70,27 +45,6 @@ KINEMATIC, CUTOFF = 200.0, 100.0
 [rad/s]"""
 PUSH_RATE = 300.0
 """how fast an external torque may change unseen while a glitch hides a current [N m/s]"""
-
-
-def truth_arm() -> Arm:
-    """The robot as it is: Table 1 of the paper, decoded, and published friction."""
-    return robots.load("abb_irb2400_16")
-
-
-def truth_drives(arm: Arm) -> Drives:
-    """Its motors with the published friction of Obal and Gierlak, which was measured at the motors."""
-    friction = [joint.friction for joint in arm.joints]
-    return Drives(
-        B=B,
-        inertia=ROTORS,
-        coulomb=np.array([f.coulomb for f in friction]),
-        static=np.array([f.static for f in friction]),
-        viscous=np.array([f.viscous for f in friction]),
-        stribeck_velocity=np.array([f.stribeck_velocity for f in friction]),
-        presliding=np.full(6, PRESLIDING),
-        ripple=np.full(6, RIPPLE),
-        ripple_period=2.0 * math.pi / GEAR,
-    )
 
 
 def prior_arm(arm: Arm, seed: int) -> Arm:
@@ -141,42 +95,28 @@ class Sensors:
     """Two current sensors per motor and the encoders: offset, gain, noise and what a reversal does to the wave."""
 
     def __init__(self, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        self._rng = rng
-        self.offset = OFFSET * NOMINAL[:, None] * rng.uniform(-1.0, 1.0, (6, 2))
-        self.gain = 1.0 + GAIN_MISMATCH * rng.uniform(-1.0, 1.0, (6, 2))
-        self.angle = rng.uniform(-math.pi, math.pi, 6)
+        self._rng = np.random.default_rng(seed)
+        self.sensors = CurrentSensors.drawn(self._rng)
 
     def read(self, motion: Motion) -> Readings:
         """Measure."""
-        i_q = motion.torque / (K_T * GEAR)
-        theta = POLE_PAIRS * GEAR * (motion.q @ B.T) + self.angle
-        a, b = phase_waves(i_q, theta, motion.dq @ B.T)
-        noise = NOISE * NOMINAL * self._rng.standard_normal((2, *a.shape))
+        speed = motion.dq @ B.T
+        a, b = self.sensors.measured(motion.torque, motion.q @ B.T, glitches(speed), self._rng)
         return Readings(
             time_ns=np.round(motion.time * 1e9).astype(np.int64),
             position=np.round(motion.q / ENCODER) * ENCODER,
-            phase_a=a * self.gain[:, 0] + self.offset[:, 0] + noise[0],
-            phase_b=b * self.gain[:, 1] + self.offset[:, 1] + noise[1],
+            phase_a=a,
+            phase_b=b,
         )
-
-
-def phase_waves(i_q: Array, theta: Array, speed: Array) -> tuple[Array, Array]:
-    """(N, n) currents of phases a and b [A] for a q-axis current [A] at an electrical angle [rad], with glitches."""
-    a = -i_q * np.sin(theta)
-    b = 0.5 * (math.sqrt(3.0) * i_q * np.cos(theta) - a)
-    w = glitches(speed)
-    return a + w * (b - a), b + w * (a - b)
 
 
 def glitches(speed: Array) -> Array:
     """(N, n) how far the two phases have passed into one another, 0 to 1: a half sine after every reversal."""
-    length = round(GLITCH * RATE)
-    pulse = np.sin(np.pi * (np.arange(length) + 0.5) / length)
+    pulse = glitch_pulse(RATE)
     found = np.zeros_like(speed)
     for j, column in enumerate(speed.T):
         way = 0.0
-        for k in np.flatnonzero(np.abs(column) > 1e-3):
+        for k in np.flatnonzero(np.abs(column) > TURNING):
             sign = math.copysign(1.0, column[k])
             if way * sign < 0.0:
                 part = pulse[: len(column) - k]

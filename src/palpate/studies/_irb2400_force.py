@@ -10,23 +10,29 @@ import numpy as np
 
 from .._core import Status, WrenchEstimator, solve_wrench
 from ..arm import Arm, Array, Effort
-from ..identify import Fit, FrictionModel, TorqueConstants, calibrate_phases, fit, fit_torque_constants
+from ..identify import (
+    Fit,
+    FrictionModel,
+    PhaseCalibration,
+    TorqueConstants,
+    calibrate_phases,
+    fit,
+    fit_torque_constants,
+)
 from ..logs import Log
 from ..logs.repair import BoolArray
 from ..phase import PhaseCurrents
-from ._geared_arm import RATE, Drives, Motion, Run, simulate
+from ..simulate.drives import Drives
+from ..simulate.irb2400 import ENCODER, GEAR, K_T, POLE_PAIRS, B, truth_arm, truth_drives
+from ._geared_arm import RATE, Motion, Run, simulate
 from ._irb2400 import (
     BEGIN,
     CURRENT_RATE,
     CUTOFF,
-    ENCODER,
     FIT_CUTOFF,
     FRICTION_ERROR,
-    GEAR,
-    K_T,
     KINEMATIC,
     PAPER_CUTOFF,
-    POLE_PAIRS,
     POSITION_RATE,
     PUSH_RATE,
     SECONDS,
@@ -34,7 +40,6 @@ from ._irb2400 import (
     STATIC_LOAD,
     STATIC_PLACE,
     TOOL_MOMENT,
-    B,
     Readings,
     Sensors,
     excitation,
@@ -43,8 +48,6 @@ from ._irb2400 import (
     static_poses,
     stop_and_go,
     there_and_back,
-    truth_arm,
-    truth_drives,
     with_load,
 )
 
@@ -57,6 +60,7 @@ class Identified:
 
     Attributes:
         arm: links as CAD has them, gains as found.
+        calibration: of every motor's sensors.
         phases: readings to motor current and torque.
         constants: from the static poses.
         gain_std: (n,) relative deviation of the gains, data sheet where the poses show nothing [1].
@@ -67,6 +71,7 @@ class Identified:
     """
 
     arm: Arm
+    calibration: tuple[PhaseCalibration, ...]
     phases: PhaseCurrents
     constants: TorqueConstants
     gain_std: Array
@@ -101,13 +106,17 @@ def as_log(readings: Readings, current: Array, names: Sequence[str]) -> Log:
     )
 
 
-def calibrated(readings: Readings, gain: Array) -> PhaseCurrents:
-    """Sensors and electrical angle from one motion of all joints."""
+def calibrated(readings: Readings) -> list[PhaseCalibration]:
+    """Sensors and electrical angles from one motion of all joints."""
     motor = readings.position @ B.T
-    found = [
+    return [
         calibrate_phases(motor[:, j], readings.phase_a[:, j], readings.phase_b[:, j], POLE_PAIRS * GEAR[j])
         for j in range(6)
     ]
+
+
+def phase_currents(found: Sequence[PhaseCalibration], gain: Array) -> PhaseCurrents:
+    """Readings to motor currents."""
     return PhaseCurrents(
         6,
         k_t=gain / GEAR,
@@ -375,7 +384,8 @@ def experiment(plan: Plan, progress: Callable[[float], None], fresh: int = 0) ->
 def identify(prior: Arm, runs: Sequence[Readings], holds: Sequence[tuple[float, float]]) -> Identified:
     """All from the robot's own motion: Fourier, stop and go, the same to hold out, static poses without and
     with the load."""
-    phases = calibrated(runs[0], K_T * GEAR)
+    calibration = calibrated(runs[0])
+    phases = phase_currents(calibration, K_T * GEAR)
     constants = torque_constants(phases, prior, runs[3:5], holds)
     # where no pose tells, the data sheet: off by as much as its tolerance
     gain = np.where(constants.seen, constants.gain, (1.0 + 0.6 * SHEET_STD) * K_T * GEAR)
@@ -387,7 +397,7 @@ def identify(prior: Arm, runs: Sequence[Readings], holds: Sequence[tuple[float, 
     residual, z, _ = motor_residual(found, arm.effort.gain(6), runs[2].position, *currents[2])
     settled = slice(3 * RATE, None)
     sliding, turning = error_model(residual[settled], z[settled])
-    return Identified(arm, phases, constants, gain_std, found, sliding, turning)
+    return Identified(arm, tuple(calibration), phases, constants, gain_std, found, sliding, turning)
 
 
 def late(wrench: Array) -> Array:

@@ -11,8 +11,9 @@ import numpy as np
 from ..arm import Array
 from ..identify import calibrate_phases
 from ..phase import PhaseCurrents
+from ..simulate.irb2400 import GAIN_MISMATCH, NOISE, OFFSET, POLE_PAIRS, phase_waves
 from ._geared_arm import RATE
-from ._irb2400 import CURRENT_RATE, GAIN_MISMATCH, NOISE, OFFSET, POLE_PAIRS, phase_waves, smooth
+from ._irb2400 import CURRENT_RATE, glitches, smooth
 
 PULLEY = 0.032
 """radius of the paper's pulley [m]"""
@@ -71,7 +72,7 @@ class Rig:
         true += RIG_INERTIA * acceleration + RIG_COULOMB * np.tanh(speed / 0.05) + RIG_VISCOUS * speed
         theta = POLE_PAIRS * turn + self._angle
         i_q = true / RIG_K_T
-        waves = phase_waves(i_q[:, None], theta[:, None], speed[:, None])
+        waves = phase_waves(i_q[:, None], theta[:, None], glitches(speed[:, None]))
         noise = NOISE * RIG_NOMINAL * self._rng.standard_normal((2, len(time), 1))
         phase_a, phase_b = (self._scale[k] * waves[k] + self._zero[k] + noise[k] for k in range(2))
         position = np.round(turn / RIG_ENCODER) * RIG_ENCODER

@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..arm import Array
+from ..simulate.irb2400 import GEAR, K_T, B
 from . import Progress, Row, _figures
 from ._geared_arm import RATE
-from ._irb2400 import BEGIN, FRICTION_ERROR, GEAR, K_T, LINK_ERROR, SECONDS, STATIC_LOAD, TOOL_MOMENT, B
+from ._irb2400 import BEGIN, FRICTION_ERROR, LINK_ERROR, SECONDS, STATIC_LOAD, TOOL_MOMENT
 from ._irb2400_force import (
     FULL,
     LAG,

@@ -20,7 +20,7 @@ from ..teleop.scenes import smooth
 from ..teleop.session import Cut, Run
 from ..teleop.setups import build
 from ..teleop.slaves import STIFFEST
-from . import Progress, Row, _figures
+from . import Progress, Row, _figures, _teleop_slaves
 from ._rows import at_most, told
 
 if TYPE_CHECKING:
@@ -51,7 +51,8 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     walls = STIFFNESS[1:2] if quick else STIFFNESS
     cuts = CUTS[1:2] if quick else CUTS
     whole = 5.5 if quick else None
-    total, begin, done = len(walls) + len(cuts) + len(COUPLINGS) + 6, clock.perf_counter(), 0
+    more = _teleop_slaves.QUICK_JOBS if quick else _teleop_slaves.JOBS
+    total, begin, done = len(walls) + len(cuts) + len(COUPLINGS) + 6 + more, clock.perf_counter(), 0
 
     def next_one() -> None:
         nonlocal done
@@ -95,6 +96,7 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     next_one()
     rows = _rows(free, pressed, dead, with_layer, without, times)
     rows += _rigid_rows(rigid) + _coupling_rows(coupled)
+    rows += _teleop_slaves.rows(quick, next_one)
     setup_notes = [
         "Slave: KUKA LBR iiwa 14 in MuJoCo with a stick of 12 cm, its model known exactly; encoders of 1 "
         "microradian, velocities with 0.1 mrad/s and "
@@ -105,10 +107,13 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
         "second while the hand holds.",
         "The contact itself gives: between the tool's way and the spring's. Stiffness felt is against what "
         "the tool meets.",
+        "ABB IRB 2400-16: the robot of the sensorless-force study in MuJoCo, with its friction, transmission, phase "
+        "currents, sensors and glitches, identified by its own motion beforehand (scripts/identify_irb2400.py); it "
+        "follows by the position control of its drives. The device moves it with motion scale 2 and force scale 0.05.",
+        "SO-101: five joints from TheRobotStudio's files, friction of the STS3215 as Rhoban/bam measured it, encoders "
+        "of 12 bit, currents in steps of 6.5 mA, 250 Hz; the leader is a twin in a hand, coupled joint to joint.",
         "Rigid wall: a box that is welded to the world; MuJoCo's contact with it is as stiff as 0.6 kN/mm. Beyond "
         f"{STIFFEST / 1e3:g} kN/m of what it touches the slave gives way like a spring.",
-        "Not measured here: SO-101 (no figures of it to write an arm from), the ABB IRB 2400 with phase "
-        "currents as slave.",
     ]
     return rows, _figures.drawn(lambda: _draw(free_run, pressed, with_layer, without)), setup_notes
 

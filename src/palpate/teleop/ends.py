@@ -11,7 +11,7 @@ from ..arm import Array
 from ..errors import DriverError
 from .coupling import Event, MasterCommand, MasterSide, SlaveCommand, SlaveSide, felt_force
 from .masters import Device
-from .slaves import Seen, SimulatedSlave
+from .slaves import InScene, Seen
 
 PERIOD = 1e-3
 """[s]"""
@@ -62,7 +62,7 @@ class SlaveEnd:
         side: where it goes.
     """
 
-    def __init__(self, slave: SimulatedSlave, side: SlaveSide) -> None:
+    def __init__(self, slave: InScene, side: SlaveSide) -> None:
         self.slave, self.side = slave, side
         self.seen: Seen = slave.seen
         self.reason = ""
@@ -72,9 +72,10 @@ class SlaveEnd:
         """One period."""
         seen = self.seen = self.slave.read()
         # noise is no work: the reference pays for what is felt
-        port: Array = felt_force(seen.force, seen.std, self.side.threshold)
+        std = seen.std if seen.felt_std is None else seen.felt_std
+        port: Array = felt_force(seen.force, std, self.side.threshold)
         command = self.side.step(
-            seen.x, seen.v, seen.force, seen.std, PERIOD, now_ns, port=port, allowed=seen.usable
+            seen.x, seen.v, seen.force, std, PERIOD, now_ns, port=port, allowed=seen.usable
         )
         self.slave.follow(command.position, command.velocity, command.force)
         out = "end of the slave's workspace" if command.events & Event.WORKSPACE else ""

@@ -53,18 +53,18 @@ class Hand:
             raise InputError(f"a hand needs mass > 0 and stiffness, damping, tremor >= 0, got {self!r}")
 
     def force(self, time: float, x: Array, v: Array) -> Array:
-        """(3,) of the hand on the device, without its own mass [N]."""
-        shake = self.tremor * np.sin(2.0 * math.pi * self.tremor_rate * time + np.array([0.0, 2.0, 4.0]))
+        """(n,) of the hand on the device, without its own mass [N]; three axes, or the joints of a leader arm."""
+        shake = self.tremor * np.sin(2.0 * math.pi * self.tremor_rate * time + 2.0 * np.arange(len(x)))
         pull: Array = self.stiffness * (self.wish(time) - x) - self.damping * v + shake
         return pull
 
 
 class Device(Protocol):
-    """What a hand holds, three axes."""
+    """What a hand holds: three axes, or the joints of a leader arm [rad, N m]."""
 
     @property
-    def force_limit(self) -> float:
-        """Largest force on the hand [N]."""
+    def force_limit(self) -> float | Array:
+        """Largest force on the hand, one number or one per axis [N]."""
 
     def read(self) -> tuple[Array, Array]:
         """(3,) place [m], (3,) velocity [m/s].

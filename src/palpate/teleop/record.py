@@ -46,6 +46,7 @@ def record(run: Run, setup: Setup, path: str | PathLike[str], *, overwrite: bool
         "round_trip_s": f"{run.round_trip:.9g}",
         "motion_scale": f"{setup.motion_scale:g}",
     }
+    units = {"m": "rad", "m/s": "rad/s", "N": "N m"} if run.tip.shape[1] != 3 else {}
     with Recorder(path, arm.joint_names, session=session, overwrite=overwrite) as out:
         events = list(run.reasons)
         for k, time in enumerate(run.time):
@@ -54,7 +55,7 @@ def record(run: Run, setup: Setup, path: str | PathLike[str], *, overwrite: bool
                 out.event(now, "held", events.pop(0)[1])
             out.sample(now, run.q[k], None, run.effort[k])
             for name, (column, unit) in _SIGNALS.items():
-                out.signal(name, now, getattr(run, column)[k], unit)
+                out.signal(name, now, getattr(run, column)[k], units.get(unit, unit))
             out.signal("master_events", now, float(run.master_events[k]))
             out.signal("slave_events", now, float(run.slave_events[k]))
         for time, _, mass, std in run.held:
@@ -75,20 +76,22 @@ def rows(run: Run, setup: Setup, cuts: tuple[Cut, ...] = ()) -> list[StudyRow]:
     def row(what: str, value: float, unit: str, note: str = "") -> StudyRow | None:
         return StudyRow(what, ours=value, unit=unit, note=note) if math.isfinite(value) else None
 
+    in_space = run.tip.shape[1] == 3
+    N, mm, mm_s = ("N", "mm", "mm/s") if in_space else ("N m", "mrad", "mrad/s")
     contact_error = float(np.abs(np.linalg.norm(run.estimated - run.true, axis=1)).mean())
     every = [
-        row("tool away from where the hand points, nothing touched, at most", 1e3 * t.tracking, "mm"),
-        row("force of the device, nothing touched, at most", t.free_force, "N"),
+        row("tool away from where the hand points, nothing touched, at most", 1e3 * t.tracking, mm),
+        row("force of the device, nothing touched, at most", t.free_force, N),
         row(
             "force felt off the true one, mean",
             100.0 * t.force_error,
             "%",
-            f"while {t.force_held:.3g} N are held",
+            f"while {t.force_held:.3g} {N} are held",
         ),
         row("stiffness felt, part of what the tool meets", 100.0 * t.stiffness, "%"),
         row("felt after the touch", 1e3 * t.onset, "ms"),
-        row("estimated against true force, mean", contact_error, "N"),
-        row("largest true force", float(np.linalg.norm(run.true, axis=1).max(initial=0.0)), "N"),
+        row("estimated against true force, mean", contact_error, N),
+        row("largest true force", float(np.linalg.norm(run.true, axis=1).max(initial=0.0)), N),
     ]
     for time, true, mass, std in run.held:
         every.append(
@@ -102,9 +105,9 @@ def rows(run: Run, setup: Setup, cuts: tuple[Cut, ...] = ()) -> list[StudyRow]:
     if cuts:
         force, speed, moved = jumps(run, cuts)
         every += [
-            row("dead link: force changes within 10 ms of the return by at most", force, "N"),
-            row("dead link: velocity of the tool changes within 10 ms by at most", 1e3 * speed, "mm/s"),
-            row("dead link: the slave's reference moves meanwhile", 1e3 * moved, "mm"),
+            row("dead link: force changes within 10 ms of the return by at most", force, N),
+            row("dead link: velocity of the tool changes within 10 ms by at most", 1e3 * speed, mm_s),
+            row("dead link: the slave's reference moves meanwhile", 1e3 * moved, mm),
         ]
     for side, tank in run.tanks.items():
         every.append(row(f"{side}: energy taken less given at the port", tank["taken"] - tank["given"], "J"))
@@ -135,15 +138,18 @@ def write_report(
         MissingExtraError: matplotlib is not installed.
     """
     scale = setup.follower.force_scale
-    axes = ("x", "y", "z")
+    joints = setup.slave.model.joint_names
+    in_space = run.tip.shape[1] == 3
+    axes = ("x", "y", "z") if in_space else joints
+    force, place, N, m = ("force", "place", "N", "m") if in_space else ("torque", "angle", "N m", "rad")
     forces = {"true": run.true, "estimated": run.estimated, "felt": run.felt / scale}
     places = {"where the hand points": run.wanted, "tool": run.tip}
     figures = {
         "Force on the tool: true (MuJoCo), estimated without a force sensor, felt by the hand": joints_figure(
-            run.time, forces, axes, quantity="force", unit="N"
+            run.time, forces, axes, quantity=force, unit=N
         ),
         "Where the hand points, and where the tool is": joints_figure(
-            run.time, places, axes, quantity="place", unit="m"
+            run.time, places, axes, quantity=place, unit=m
         ),
         "Energy in the tanks of the two sides": joints_figure(
             run.time, {"level": run.levels}, ("master", "slave"), quantity="energy", unit="J"

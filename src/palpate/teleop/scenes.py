@@ -15,6 +15,8 @@ from ..simulate._model import mujoco
 
 SceneName: TypeAlias = Literal["wall", "rigid", "surface", "peg", "lift"]
 
+SlaveKind: TypeAlias = Literal["torque", "phase_currents", "servos"]
+
 PROBE = 0.015
 """radius of the tool's tip [m]"""
 TOOL = 0.12
@@ -281,6 +283,14 @@ class SlaveArm:
         arm: with the tool as a shape, its grasp point at the centre of the tool's tip.
         q: (n,) pose at the start [rad].
         force_scale: force felt per force of the environment, so that the device's range fits the arm's [1].
+        speed: of its reference at most [m/s].
+        threshold: of what is felt, in standard deviations [1]: at 1 kHz three are passed every third of a second.
+        gain: with which the reference closes on the master's place [1/s].
+        motion_scale: motion of the arm per motion of the hand [1].
+        force_limit: largest force that is told [N].
+        masses: of objects that suit it [kg].
+        kind: "torque": follows by torque, its joint torques are measured; "phase_currents": follows by the position
+            control of its drives, measures its phase currents; "servos": hobby servos, led joint by joint by its twin.
         assumed: what no source states and was taken, one sentence each.
     """
 
@@ -288,12 +298,23 @@ class SlaveArm:
     q: Array
     force_scale: float
     assumed: tuple[str, ...]
+    speed: float = 0.5
+    threshold: float = 5.0
+    gain: float = 60.0
+    motion_scale: float = 1.0
+    force_limit: float = 100.0
+    masses: tuple[float, ...] = (0.5, 1.2)
+    kind: SlaveKind = "torque"
 
 
 _POSES = {
     "kuka_lbr_iiwa14": (0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
     "kuka_lbr_iiwa7": (0.0, 0.5, 0.0, -1.5, 0.0, 1.1, 0.0),
+    "abb_irb2400_16": (0.0, 0.3, 0.1, 0.0, 0.9, 0.0),
+    "so101": (0.0, -0.2, 0.2, 0.9, 0.0),
 }
+SLAVES = tuple(_POSES)
+"""arms that can be slaves in the scenes here"""
 
 
 def slave_arm(name: str) -> SlaveArm:
@@ -310,9 +331,41 @@ def slave_arm(name: str) -> SlaveArm:
     centre[:3, :3] = T[:3, :3]
     centre[:3, 3] = T[:3, :3] @ np.array([0.0, 0.0, 0.5 * TOOL]) + T[:3, 3]
     tool = Shape(kind="capsule", size=(PROBE, TOOL), T=centre, link=bare.n - 1, rgba=(0.3, 0.3, 0.34, 1.0))
+    shapes, grasp = (*bare.shapes, tool), np.array([0.0, 0.0, TOOL])
+    if name == "so101":
+        return SlaveArm(
+            bare.replace(shapes=shapes, grasp=grasp),
+            np.array(_POSES[name]),
+            1.0,
+            (
+                "load friction of the SO-101's gears as measured on the 7.4 V servo; its current is good to a step of "
+                "6.5 mA",
+            ),
+            gain=60.0,
+            threshold=5.0,
+            masses=(0.1, 0.2),
+            kind="servos",
+        )
+    if name == "abb_irb2400_16":
+        return SlaveArm(
+            bare.replace(shapes=shapes, grasp=grasp),
+            np.array(_POSES[name]),
+            0.05,
+            (
+                "torque constants, gears, rotors, presliding, ripple and the errors of the current sensors of the ABB: "
+                "no source states them; they are those of the sensorless-force study",
+            ),
+            speed=0.8,
+            threshold=3.0,
+            gain=20.0,
+            motion_scale=2.0,
+            force_limit=200.0,
+            masses=(6.0, 14.0),
+            kind="phase_currents",
+        )
     sensing = Sensing(position_resolution=1e-6, position_std=0.0, velocity_std=1e-4, torque_std=0.05)
     joints = tuple(j.replace(sensing=sensing) for j in bare.joints)
-    arm = bare.replace(joints=joints, shapes=(*bare.shapes, tool), grasp=np.array([0.0, 0.0, TOOL]))
+    arm = bare.replace(joints=joints, shapes=shapes, grasp=grasp)
     return SlaveArm(
         arm,
         np.array(_POSES[name]),

@@ -16,8 +16,8 @@ from ..errors import InputError
 from .channel import Faults, FaultyLine, Sealer
 from .coupling import Event, MasterSide, SlaveSide
 from .ends import PERIOD, MasterEnd, SlaveEnd
-from .masters import HapticDevice
-from .slaves import SimulatedSlave
+from .masters import Device
+from .slaves import InScene
 
 Progress: TypeAlias = Callable[[float, float], None]
 """told the simulated time and the whole time [s], now and then"""
@@ -52,6 +52,8 @@ class Cut:
 @dataclass(slots=True, eq=False)
 class Run:
     """What happened, one row per period; (N, 3) in base axes of the slave, but the device's own columns.
+
+    Joint to joint they are (N, n), with [rad] and [N m] in place of [m] and [N].
 
     Attributes:
         time: (N,) [s].
@@ -103,25 +105,25 @@ class Run:
     held: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     @classmethod
-    def empty(cls, count: int, n: int) -> Run:
-        """Room for `count` periods of a slave with `n` joints."""
+    def empty(cls, count: int, n: int, axes: int = 3) -> Run:
+        """Room for `count` periods of a slave with `n` joints of which `axes` are coupled."""
 
-        def three() -> Array:
-            return np.zeros((count, 3))
+        def each() -> Array:
+            return np.zeros((count, axes))
 
         return cls(
             time=np.arange(count, dtype=np.float64) * PERIOD,
-            device=three(),
-            device_velocity=three(),
-            wanted=three(),
-            tip=three(),
-            tip_velocity=three(),
-            reference=three(),
-            force=three(),
-            felt=three(),
-            estimated=three(),
-            std=three(),
-            true=three(),
+            device=each(),
+            device_velocity=each(),
+            wanted=each(),
+            tip=each(),
+            tip_velocity=each(),
+            reference=each(),
+            force=each(),
+            felt=each(),
+            estimated=each(),
+            std=each(),
+            true=each(),
             master_events=np.zeros(count, dtype=np.int64),
             slave_events=np.zeros(count, dtype=np.int64),
             levels=np.zeros((count, 2)),
@@ -130,9 +132,17 @@ class Run:
         )
 
 
+def _weighs(since: float, force: Array, std: Array) -> bool:
+    """An object lifted `since` [s] can be weighed: settled, and known to a twentieth; or it is high time.
+
+    Where friction hides the weight at rest, that is once the arm moves.
+    """
+    return since >= 0.5 and (since >= 2.5 or bool(np.all(std <= 0.05 * abs(float(force.mean())))))
+
+
 def run(
-    device: HapticDevice,
-    slave: SimulatedSlave,
+    device: Device,
+    slave: InScene,
     master_side: MasterSide,
     slave_side: SlaveSide,
     seconds: float,
@@ -160,7 +170,7 @@ def run(
         faults: of the network, each way; None: none.
         cuts: when the link is dead.
         closed: the clutch at a time [s].
-        weigh: weigh what is lifted, from the force at rest.
+        weigh: weigh what is lifted.
         progress: told how far it is.
         stop: asked now and then; True ends the run there.
         tap: called at the end of every period; what it wants is done in the next one.
@@ -172,12 +182,12 @@ def run(
     if not 0.0 < seconds <= 3600.0:
         raise InputError(f"seconds must be above 0 to 3600, got {seconds!r}")
     count = round(seconds / PERIOD)
-    out = Run.empty(count, slave.model.n)
+    out = Run.empty(count, slave.model.n, slave.axes)
     rng = np.random.default_rng(seed)
     key = rng.bytes(32)
     boxes = {
-        "master": Sealer(key, "master", 1, 3, salt=rng.bytes(8)),
-        "slave": Sealer(key, "slave", 1, 3, salt=rng.bytes(8)),
+        "master": Sealer(key, "master", 1, slave.axes, salt=rng.bytes(8)),
+        "slave": Sealer(key, "slave", 1, slave.axes, salt=rng.bytes(8)),
     }
     there, back = (FaultyLine(seed=seed + k) for k in range(2))
     sent = [0, 0]
@@ -209,10 +219,12 @@ def run(
         packet = boxes["slave"].seal(slave_side.message(), now)
         sent[1] += len(packet) + 28
         back.send(packet, now)
-        if weigh and picked and time >= picked_at + 0.5:
-            # at rest what is felt is the weight; from then on it is known, and the hand is spared it
-            lately = out.estimated[k - 200 : k, 2]
-            found, std = float(-lately.mean() / 9.81), float(out.std[k - 1, 2] / 9.81)
+        lately, sure = out.estimated[k - 200 : k, 2], out.std[k - 200 : k, 2]
+        if weigh and picked and _weighs(time - picked_at, lately, sure):
+            # what is felt is the weight; from then on it is known, and the hand is spared it
+            rise = out.tip_velocity[k - 200 : k, 2]
+            pull = 9.81 + float(rise[-1] - rise[0]) / (len(rise) * PERIOD)
+            found, std = float(-lately.mean() / pull), float(out.std[k - 1, 2] / pull)
             out.held.append((time, picked, found, std))
             slave.hold(max(0.0, found))
             picked = None

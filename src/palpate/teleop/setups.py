@@ -11,20 +11,22 @@ from .._core import LinkOptions, TankOptions
 from ..arm import Array
 from .channel import Faults
 from .coupling import CouplingName, MasterSide, SlaveSide
+from .industrial import IndustrialSlave
 from .masters import Device, Hand, HapticDevice
-from .scenes import Scene, find, slave_arm
+from .scenes import Scene, SlaveArm, find, slave_arm
+from .servo_arms import ServoSlave, SimulatedLeader, joint_path
 from .session import Cut, Progress, Run, run
-from .slaves import STIFFEST, SimulatedSlave
+from .slaves import STIFFEST, InScene, SimulatedSlave
 
 TANK = {"initial": 0.05, "desired": 0.1, "most": 0.5}
 """of both sides [J]: what a hand gives that presses 5 N over 2 cm; without an initial charge the first touch finds
 nothing to pay with"""
 CONTACT_DAMPING = 30.0
 """of the device in contact [N s/m]: it makes up for the estimate's 6 ms and the line's 1 ms"""
-THRESHOLD = 5.0
-"""of what is felt, in standard deviations [1]: at 1 kHz three are passed every third of a second"""
 ACCELERATION = 10.0
 """of the slave's reference at most [m/s^2]: twice what a hand does, and what the arm's joints can follow"""
+JOINT_HAND = {"mass": 0.03, "stiffness": 25.0, "damping": 1.2, "tremor": 0.01}
+"""a :class:`Hand` of 0.5 kg, 400 N/m at a lever of a quarter metre [kg m^2, N m/rad, N m s/rad, N m]"""
 REACH = 0.3
 """of the workspace to each side of the start [m]"""
 
@@ -45,8 +47,8 @@ class Setup:
     """
 
     scene: Scene | None
-    device: HapticDevice
-    slave: SimulatedSlave
+    device: Device
+    slave: InScene
     master: MasterSide
     follower: SlaveSide
     motion_scale: float
@@ -88,8 +90,8 @@ def build(
     coupling: CouplingName = "force_position",
     stiffness: float = 2000.0,
     press: float = 0.02,
-    masses: tuple[float, ...] = (0.5, 1.2),
-    motion_scale: float = 1.0,
+    masses: tuple[float, ...] | None = None,
+    motion_scale: float | None = None,
     force_scale: float | None = None,
     hand: Hand | None = None,
     passive: bool = True,
@@ -104,8 +106,8 @@ def build(
         coupling: "force_position", "position_position" or "four_channel".
         stiffness: of the wall [N/m].
         press: how far behind the wall or the surface the hand goes [m].
-        masses: of the objects to lift [kg].
-        motion_scale: motion of the slave per motion of the master [1].
+        masses: of the objects to lift [kg]; None: what suits the arm.
+        motion_scale: motion of the slave per motion of the master [1]; None: what suits device and arm.
         force_scale: force felt per force of the environment [1]; None: what suits device and arm.
         hand: who holds the device; None: the scene's script.
         passive: the passivity layer.
@@ -116,6 +118,8 @@ def build(
         InputError: a name or a number is wrong.
         MissingExtraError: mujoco or cryptography is not installed.
     """
+    chosen = slave_arm(arm)
+    motion_scale = chosen.motion_scale if motion_scale is None else motion_scale
     shared = Shared(coupling, passive)
     slave, follower, place, assumed = build_slave(
         scene,
@@ -129,12 +133,19 @@ def build(
         stiffest=stiffest,
         seed=seed,
     )
-    device = HapticDevice(hand or scripted(place, motion_scale))
+    device: Device
+    if chosen.kind == "servos":
+        device = SimulatedLeader(chosen.arm, chosen.q, hand or scripted_joints(place, chosen), seed=seed + 1)
+        motion_scale = 1.0
+        master = _leading(chosen.arm.n, device, shared)
+    else:
+        device = HapticDevice(hand or scripted(place, motion_scale))
+        master = build_master(device, shared)
     return Setup(
         scene=place,
         device=device,
         slave=slave,
-        master=build_master(device, shared),
+        master=master,
         follower=follower,
         motion_scale=motion_scale,
         seconds=10.0 if place is None else place.seconds,
@@ -168,6 +179,13 @@ def scripted(scene: Scene | None, motion_scale: float = 1.0) -> Hand:
     return Hand() if path is None else Hand(wish=lambda t: np.asarray(path(t)) / motion_scale)
 
 
+def scripted_joints(scene: Scene | None, chosen: SlaveArm) -> Hand:
+    """The same at the joints of a leader arm."""
+    arm, q = chosen.arm, chosen.q
+    wish = (lambda time: q) if scene is None else joint_path(arm, q, scene.path, scene.seconds)
+    return Hand(wish=wish, **JOINT_HAND)
+
+
 def build_master(device: Device, shared: Shared) -> MasterSide:
     """What the hand feels that holds a device."""
     return MasterSide(3, device.force_limit, contact_damping=CONTACT_DAMPING, **shared.options())
@@ -180,12 +198,12 @@ def build_slave(
     shared: Shared,
     stiffness: float = 2000.0,
     press: float = 0.02,
-    masses: tuple[float, ...] = (0.5, 1.2),
-    motion_scale: float = 1.0,
+    masses: tuple[float, ...] | None = None,
+    motion_scale: float | None = None,
     force_scale: float | None = None,
     stiffest: float = STIFFEST,
     seed: int = 0,
-) -> tuple[SimulatedSlave, SlaveSide, Scene | None, tuple[str, ...]]:
+) -> tuple[InScene, SlaveSide, Scene | None, tuple[str, ...]]:
     """An arm in a scene, where it goes, the scene, and what is assumed of it; options of :func:`build`.
 
     Raises:
@@ -195,18 +213,64 @@ def build_slave(
     chosen = slave_arm(arm)
     T = chosen.arm.forward_kinematics(chosen.q)
     tip: Array = T[:3, :3] @ chosen.arm.grasp + T[:3, 3]
-    place = None if scene is None else find(scene, tip, stiffness=stiffness, press=press, masses=masses)
-    slave = SimulatedSlave(chosen.arm, chosen.q, place, seed=seed, stiffest=stiffest)
+    lifted = chosen.masses if masses is None else masses
+    place = None if scene is None else find(scene, tip, stiffness=stiffness, press=press, masses=lifted)
+    if chosen.kind == "servos":
+        return ServoSlave(chosen.arm, chosen.q, place, seed=seed), _led(chosen, shared), place, chosen.assumed
+    slave = (
+        IndustrialSlave(chosen.arm, chosen.q, place, seed=seed)
+        if chosen.kind == "phase_currents"
+        else SimulatedSlave(chosen.arm, chosen.q, place, seed=seed, stiffest=stiffest)
+    )
     side = SlaveSide(
         3,
-        0.5,
+        chosen.speed,
         lower=tip - REACH,
         upper=tip + REACH,
-        force_limit=100.0,
+        force_limit=chosen.force_limit,
         acceleration=ACCELERATION,
-        threshold=THRESHOLD,
-        motion_scale=motion_scale,
+        threshold=chosen.threshold,
+        gain=chosen.gain,
+        motion_scale=chosen.motion_scale if motion_scale is None else motion_scale,
         force_scale=chosen.force_scale if force_scale is None else force_scale,
         **shared.options(),
     )
     return slave, side, place, chosen.assumed
+
+
+def _leading(n: int, device: Device, shared: Shared) -> MasterSide:
+    """What a hand feels that leads a twin: [rad, N m] in place of [m, N]."""
+    return MasterSide(
+        n,
+        device.force_limit,
+        stiffness=6.0,
+        damping=0.1,
+        fill=0.02,
+        contact_damping=0.3,
+        hold_stiffness=5.0,
+        hold_damping=0.1,
+        acceleration=200.0,
+        resync_rate=10.0,
+        **shared.options(),
+    )
+
+
+def _led(chosen: SlaveArm, shared: Shared) -> SlaveSide:
+    """Where the twin goes."""
+    limits = [j.limits for j in chosen.arm.joints]
+    return SlaveSide(
+        chosen.arm.n,
+        [limit.velocity for limit in limits],
+        lower=[limit.lower for limit in limits],
+        upper=[limit.upper for limit in limits],
+        force_limit=[limit.effort for limit in limits],
+        acceleration=60.0,
+        threshold=chosen.threshold,
+        task_space=False,
+        gain=chosen.gain,
+        resync="approach",
+        resync_speed=0.2,
+        resync_acceleration=1.0,
+        wall=5.0,
+        **shared.options(),
+    )

@@ -13,6 +13,7 @@ from .._core import HeldLoad, MomentumObserver, Status, WrenchEstimator
 from ..arm import Arm, Array
 from ..drivers.mujoco import MujocoDriver
 from ..errors import DriverError, InputError
+from ..logs import Sample
 from ..pipeline import Pipeline, Touch
 from ..simulate import Load, Plant, SensorModel
 
@@ -57,6 +58,7 @@ class Seen:
         force, std: (3,) of the environment on the tool as estimated, base axes [N].
         reason: why it holds or slows down, empty: it does not.
         usable: it may be moved.
+        felt_std: (3,) deviation that decides what a hand is shown [N]; None: `std`.
     """
 
     time_ns: int
@@ -68,6 +70,7 @@ class Seen:
     std: Array
     reason: str
     usable: bool
+    felt_std: Array | None = None
 
 
 class Stiffness:
@@ -154,8 +157,6 @@ class ArmSlave:
         self.driver = driver
         self.model = driver.plant.arm if model is None else model
         arm = self.model
-        self._core = arm.core
-        self._pipeline = self._made(held)
         self._period = driver.period_ns * 1e-9
         low = np.array([j.limits.lower for j in arm.joints])
         high = np.array([j.limits.upper for j in arm.joints])
@@ -170,31 +171,32 @@ class ArmSlave:
         self.driver.enable()
         sample = self.driver.read()
         assert sample is not None
-        self._touch = self._pipeline.step(sample)
+        self._sample = sample
+        self.hold(held)
+        self._take(sample)
         self._q_ref = np.array(sample.position)
         self._home = self._q_ref.copy()
         self._dq_ref = np.zeros(arm.n)
         self._taken_off = np.zeros(arm.n)
         self._stiffest, self._stiffness = stiffest, Stiffness(stiffest)
         self._R0 = self._pose(self._q_ref)[0]
-        self._sample = sample
         self._reason = ""
         self.seen = self._see()
-
-    def _made(self, held: float) -> Pipeline:
-        return Pipeline(
-            self.model,
-            observer=MomentumObserver(bandwidth=OBSERVER),
-            payload=None,
-            wrench=WrenchEstimator(moment_prior_std=3.0),
-            load=HeldLoad(mass=held),
-        )
 
     def hold(self, mass: float) -> None:
         """From now on this mass in the hand is known [kg]: its weight and inertia are not felt. The estimate
         starts anew."""
-        self._pipeline = self._made(mass)
-        self._touch = self._pipeline.step(self._sample)
+        self._pipeline = Pipeline(
+            self.model,
+            observer=MomentumObserver(bandwidth=OBSERVER),
+            payload=None,
+            wrench=WrenchEstimator(moment_prior_std=3.0),
+            load=HeldLoad(mass=mass),
+        )
+
+    def _take(self, sample: Sample) -> None:
+        """Estimate what touches."""
+        self._touch = self._pipeline.step(sample)
 
     def _pose(self, q: Array) -> tuple[Array, Array, Array]:
         """R_base_tip, place of the tool's tip, (6, n) Jacobian there."""
@@ -249,7 +251,7 @@ class ArmSlave:
         self._lost = 0 if sample is not None else self._lost + 1
         if sample is not None:
             self._sample = sample
-            self._touch = self._pipeline.step(sample)
+            self._take(sample)
         else:
             self._reason = "device: a sample was lost"
         self.seen = self._see()
@@ -262,6 +264,16 @@ class ArmSlave:
         Returns:
             (n,) torque sent [N m]; zeros if the drives are off.
         """
+        J, ddq_ref = self._lead(x_ref, v_ref)
+        pushed = np.zeros(self.model.n) if push is None else J[:3].T @ push
+        torque = self._torque(J, ddq_ref, pushed)
+        if self.driver.state != "enabled":
+            return np.zeros(self.model.n)
+        return self.driver.write(np.clip(torque, -self._effort, self._effort))
+
+    def _lead(self, x_ref: Array, v_ref: Array) -> tuple[Array, Array]:
+        """Move the joints' reference by a period towards the tip's; (6, n) Jacobian and the reference's
+        acceleration (n,) [rad/s^2]."""
         n, h = self.model.n, self._period
         R, tip, J = self._pose(self._q_ref)
         turn = self._R0 @ R.T
@@ -287,25 +299,25 @@ class ArmSlave:
         ddq_ref = np.clip(((inside - self._q_ref) / h - self._dq_ref) / h, -_JERKY, _JERKY)
         rates = self._dq_ref + h * ddq_ref
         self._q_ref, self._dq_ref = np.clip(self._q_ref + h * rates, self._low, self._high), rates
+        return J, ddq_ref
 
-        seen, external = self.seen, self._touch.external
+    def _torque(self, J: Array, ddq_ref: Array, pushed: Array) -> Array:
+        """(n,) that takes the joints along their reference, and `pushed` (n,) beside it [N m]."""
+        seen, external, h = self.seen, self._touch.external, self._period
         self._stiffness.step(seen, h)
         share = self._stiffness.share
-        behind, ahead = self._q_ref - seen.q, share * rates
+        behind, ahead = self._q_ref - seen.q, share * self._dq_ref
         a = share * ddq_ref + BANDWIDTH**2 * behind + 2.0 * BANDWIDTH * (ahead - seen.dq)
         if share < 1.0:
             a = a - (1.0 - share) * self._too_stiff(J[:3], seen.q, behind)
         torque = self.model.inverse_dynamics(seen.q, seen.dq, a) + self.model.friction_torque(seen.dq)
-        pushed = np.zeros(n) if push is None else J[:3].T @ push
         if external.status == Status.ok:
             # what the hand's push already bears is not taken off a second time
             self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (
                 external.torque + pushed - self._taken_off
             )
-        torque = torque + share * (pushed - self._taken_off)
-        if self.driver.state != "enabled":
-            return np.zeros(n)
-        return self.driver.write(np.clip(torque, -self._effort, self._effort))
+        found: Array = torque + share * (pushed - self._taken_off)
+        return found
 
     def _too_stiff(self, J: Array, q: Array, behind: Array) -> Array:
         """(n,) of the joints' acceleration, what the tip's stiffness above `stiffest` has in it [rad/s^2].
@@ -329,40 +341,32 @@ class ArmSlave:
         self.driver.close()
 
 
-class SimulatedSlave(ArmSlave):
-    """An :class:`ArmSlave` in MuJoCo, in a scene, with the truth beside it.
+class InScene(ArmSlave):
+    """An :class:`ArmSlave` whose driver is MuJoCo's, in a scene, with the truth beside it.
 
     Args:
-        arm: as it is, with its tool; see :func:`palpate.teleop.scenes.slave_arm`.
-        q: (n,) pose at the start [rad].
+        driver: in its scene.
         scene: what there is to touch; None: nothing.
         model: as it is known; None: exactly.
-        seed: of the sensors' noise.
         stiffest: see :class:`ArmSlave`.
-
-    Raises:
-        InputError: the pose does not fit.
-        MissingExtraError: mujoco is not installed.
     """
 
     def __init__(
         self,
-        arm: Arm,
-        q: Array,
-        scene: Scene | None = None,
+        driver: MujocoDriver,
+        scene: Scene | None,
         *,
         model: Arm | None = None,
-        seed: int = 0,
         stiffest: float = STIFFEST,
     ) -> None:
-        if np.shape(q) != (arm.n,):
-            raise InputError(f"q: expected {arm.n} angles, got {np.shape(q)}")
-        build = None if scene is None else scene.build
-        plant = Plant(arm, contacts=build is not None, scene=build, timestep=2.5e-4, integrator="discrete")
-        driver = MujocoDriver(plant, sensor=SensorModel(arm, rate=RATE, seed=seed), q=q)
         super().__init__(driver, model=model, stiffest=stiffest)
         self._masses = list(() if scene is None else scene.masses)
         self._contact = np.zeros(6)
+
+    @property
+    def axes(self) -> int:
+        """What is coupled: three of space, or the joints."""
+        return 3
 
     @property
     def plant(self) -> Plant:
@@ -396,6 +400,40 @@ class SimulatedSlave(ArmSlave):
             own = _of_arm(model, contact.geom2)
             total += force if own else -force
         return total
+
+
+class SimulatedSlave(InScene):
+    """An :class:`ArmSlave` in MuJoCo, in a scene, with the truth beside it.
+
+    Args:
+        arm: as it is, with its tool; see :func:`palpate.teleop.scenes.slave_arm`.
+        q: (n,) pose at the start [rad].
+        scene: what there is to touch; None: nothing.
+        model: as it is known; None: exactly.
+        seed: of the sensors' noise.
+        stiffest: see :class:`ArmSlave`.
+
+    Raises:
+        InputError: the pose does not fit.
+        MissingExtraError: mujoco is not installed.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        q: Array,
+        scene: Scene | None = None,
+        *,
+        model: Arm | None = None,
+        seed: int = 0,
+        stiffest: float = STIFFEST,
+    ) -> None:
+        if np.shape(q) != (arm.n,):
+            raise InputError(f"q: expected {arm.n} angles, got {np.shape(q)}")
+        build = None if scene is None else scene.build
+        plant = Plant(arm, contacts=build is not None, scene=build, timestep=2.5e-4, integrator="discrete")
+        driver = MujocoDriver(plant, sensor=SensorModel(arm, rate=RATE, seed=seed), q=q)
+        super().__init__(driver, scene, model=model, stiffest=stiffest)
 
 
 def _of_arm(model: Any, geom: int) -> bool:

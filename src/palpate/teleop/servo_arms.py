@@ -1,0 +1,304 @@
+"""A leader arm and its twin, of hobby servos: joint to joint, as SO-101 and GELLO are used; the leader can push back.
+
+The leader is any driver of servos that takes torque: the simulated one, or a real arm on a Feetech or Dynamixel bus.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .._core import HeldLoad, MomentumObserver, Status
+from ..arm import Arm, Array, Sensing
+from ..drivers.driver import Driver
+from ..drivers.mujoco import MujocoDriver
+from ..errors import InputError
+from ..logs import Sample
+from ..pipeline import Pipeline
+from ..simulate import Plant, SensorModel
+from .masters import Hand
+from .motor_force import LowPass
+from .slaves import RATE, InScene, Seen
+
+if TYPE_CHECKING:
+    from .scenes import Scene
+
+COUNT = 2.0 * math.pi / 4096.0
+"""of the encoders, 12 bit a turn [rad]"""
+TORQUE_CONSTANT = 2.94 / 2.7
+"""at the horn, stall torque over stall current of the STS3215-C018 [N m/A]"""
+CURRENT_STEP = 6.5e-3
+"""of the current that it reports [A]"""
+LOAD_FRICTION = 0.2116
+"""part of the load its gears lose (Rhoban/bam, feetech_sts3215_7_4V, m3) [1]"""
+BANDWIDTH = 50.0
+"""of the follower's position control [rad/s]: encoders of 12 bit allow no more"""
+STIFFENING = 6.0
+"""bandwidth with which the external torque is taken off [rad/s]"""
+BUS_RATE = 250.0
+"""readings and commands per second, what a bus of six servos at 1 Mbit/s allows [Hz]"""
+OBSERVER = 30.0
+"""bandwidth of the follower's momentum observer [rad/s]"""
+CERTAIN, GONE = 64.0, 16.0
+"""a touch is certain where the sum of the joints' (torque/std)^2 is above the one, until it is below the other [1]"""
+TURNING = 0.05
+"""speed from which on the sign of friction is known: the encoder has turned a few counts lately [rad/s]"""
+VELOCITY = 200.0
+"""low-pass of positions before velocities are taken [rad/s]"""
+
+
+def with_servos(arm: Arm) -> Arm:
+    """The arm with what its servos measure: 12 bit of position, no velocity, current in steps."""
+    sensing = Sensing(
+        position_resolution=COUNT,
+        position_std=0.0,
+        torque_std=CURRENT_STEP * TORQUE_CONSTANT / math.sqrt(12.0),
+    )
+    return arm.replace(joints=tuple(j.replace(sensing=sensing) for j in arm.joints))
+
+
+def with_load_friction(arm: Arm) -> Arm:
+    """The arm as it is: its gears lose a part of what they carry."""
+    return arm.replace(
+        joints=tuple(j.replace(friction=replace(j.friction, load=LOAD_FRICTION)) for j in arm.joints)
+    )
+
+
+class LeaderArm:
+    """A leader arm behind the driver contract, as a master of n axes [rad, N m].
+
+    Its motors bear its weight, so that a hand moves it freely, and add what is to be felt. Friction of the leader's own
+    gears is felt too: it is not compensated, because a compensation that is too large would move by itself.
+
+    Args:
+        driver: of the arm; connected and enabled here.
+        arm: its model.
+        force_limit: (n,) torque that is added at most, or one number [N m].
+    """
+
+    def __init__(self, driver: Driver, arm: Arm, *, force_limit: float | Array = 2.0) -> None:
+        self.driver, self.arm = driver, arm
+        self.force_limit: Array = np.broadcast_to(np.asarray(force_limit, dtype=np.float64), (arm.n,))
+        self._period = driver.period_ns * 1e-9
+        self._position = LowPass(VELOCITY, self._period)
+        driver.connect()
+        driver.enable()
+        self._dq = np.zeros(arm.n)
+        self._smooth: Array | None = None
+        self._due = 0.0
+        self._take(driver.read())
+
+    def _take(self, sample: Sample | None) -> None:
+        if sample is None:
+            return
+        q = np.asarray(sample.position)
+        smooth = self._position(q)
+        before = smooth if self._smooth is None else self._smooth
+        self._dq = (
+            (smooth - before) / self._period if sample.velocity is None else np.asarray(sample.velocity)
+        )
+        self._q, self._smooth = q.copy(), smooth
+
+    def read(self) -> tuple[Array, Array]:
+        """(n,) joint positions [rad], (n,) velocities [rad/s]."""
+        return self._q, self._dq
+
+    def step(self, force: Array, dt: float) -> None:
+        """Push back with a torque (n,) [N m] for `dt` [s]; the bus is slower than the coupling, so it is told now and
+        then, and the next sample is waited for.
+
+        Raises:
+            DriverError: the arm does not answer.
+        """
+        self._due += dt
+        if self._due < self._period - 1e-9:
+            return
+        self._due = 0.0
+        felt = np.clip(force, -self.force_limit, self.force_limit)
+        self.driver.write(self.arm.gravity_torque(self._q) + felt)
+        self._take(self.driver.read())
+
+    def close(self) -> None:
+        """Stop the drives and let go."""
+        self.driver.close()
+
+
+class HeldPlant(Plant):
+    """A simulated arm in a hand, whose impedance acts on its joints: [rad, N m] in place of [m, N].
+
+    Args:
+        arm: as it is.
+        hand: who holds it.
+    """
+
+    def __init__(self, arm: Arm, hand: Hand) -> None:
+        self._hand = hand
+        super().__init__(arm, timestep=5e-4, integrator="discrete")
+
+    def _advance(self, tau: Array, count: int, h: float) -> None:
+        mine = tau + self._hand.force(self.time_ns * 1e-9, self._q, self._dq)
+        np.subtract(mine, self._offset, out=self._applied)
+        super()._advance(tau, count, h)
+
+
+class SimulatedLeader(LeaderArm):
+    """A leader in MuJoCo, in a hand.
+
+    Args:
+        arm: the leader.
+        q: (n,) pose at the start [rad].
+        hand: its wish in joint angles [rad], its impedance at the joints [N m/rad, N m s/rad].
+        seed: of the sensors' noise.
+    """
+
+    def __init__(self, arm: Arm, q: Array, hand: Hand, *, seed: int = 0) -> None:
+        known = with_servos(arm)
+        rotors = tuple(j.replace(rotor_inertia=j.rotor_inertia + hand.mass) for j in known.joints)
+        plant = HeldPlant(known.replace(joints=rotors), hand)
+        sensor = SensorModel(known, rate=BUS_RATE, seed=seed)
+        super().__init__(MujocoDriver(plant, sensor=sensor, q=q), known)
+
+
+class ServoSlave(InScene):
+    """The follower: joint references in, external torque of the joints out, from positions and currents of its servos.
+
+    Computed torque with feed-forward friction. The external torque is that of the momentum observer; its deviation
+    has in it what friction may hide: all of Coulomb and load friction at rest, less the faster a joint turns::
+
+        std^2 = std_observer^2 + ((F_c + mu |tau|)/sqrt(3))^2 (1 - tanh^2(dq/v))
+
+    Args:
+        arm: with its tool.
+        q: (n,) pose at the start [rad].
+        scene: what there is to touch; None: nothing.
+        seed: of the sensors' noise.
+    """
+
+    def __init__(self, arm: Arm, q: Array, scene: Scene | None = None, *, seed: int = 0) -> None:
+        if np.shape(q) != (arm.n,):
+            raise InputError(f"q: expected {arm.n} angles, got {np.shape(q)}")
+        known = with_servos(arm)
+        build = None if scene is None else scene.build
+        plant = Plant(
+            with_load_friction(known),
+            contacts=build is not None,
+            scene=build,
+            timestep=2.5e-4,
+            integrator="discrete",
+        )
+        self._coulomb = np.array([j.friction.coulomb for j in known.joints])
+        self._certain = False
+        driver = MujocoDriver(plant, sensor=SensorModel(known, rate=BUS_RATE, seed=seed), q=q)
+        self._every, self._tick = round(RATE / BUS_RATE), 0
+        super().__init__(driver, scene, model=known)
+
+    @property
+    def axes(self) -> int:
+        """The joints."""
+        return self.model.n
+
+    def hold(self, mass: float) -> None:
+        """From now on this mass in the hand is known [kg]: its weight and inertia are not felt."""
+        self._pipeline = Pipeline(
+            self.model,
+            observer=MomentumObserver(bandwidth=OBSERVER),
+            payload=None,
+            wrench=None,
+            load=HeldLoad(mass=mass),
+        )
+
+    def read(self) -> Seen:
+        """What is known; the bus tells something new every few periods."""
+        self._tick += 1
+        return super().read() if self._tick % self._every == 1 else self.seen
+
+    def _see(self) -> Seen:
+        touch, q = self._touch, np.asarray(self._sample.position)
+        external = touch.external
+        dq = np.asarray(touch.dq)
+        good = external.status == Status.ok
+        known = np.tanh(dq / TURNING) ** 2
+        load = np.abs(np.asarray(self._sample.effort))
+        hidden = (self._coulomb + LOAD_FRICTION * load) / math.sqrt(3.0)
+        # gears that turn lose a part of their load, against the motion
+        lost = LOAD_FRICTION * load * np.tanh(dq / TURNING)
+        torque = np.asarray(external.torque) + lost if good else np.zeros(self.axes)
+        std = np.sqrt(np.square(external.std) + np.square(hidden) * (1.0 - known))
+        surprise = float(np.square(torque / std).sum())
+        self._certain = good and surprise > (GONE if self._certain else CERTAIN)
+        std = std if good else np.full(self.axes, np.inf)
+        # that there is a touch is certain then, and the question is its size
+        shown = 0.25 * std if self._certain else std
+        usable = good and self._lost == 0
+        return Seen(self._sample.time_ns, q, dq, q, dq, torque, std, self._reason, usable, shown)
+
+    def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:
+        """Send the torque that takes the joints to `x_ref` (n,) [rad] at `v_ref` (n,) [rad/s].
+
+        Returns:
+            (n,) torque sent [N m]; zeros if nothing is: the bus is busy, or the drives are off.
+        """
+        if self._tick % self._every != 1:
+            return np.zeros(self.axes)
+        h, seen = self._period, self.seen
+        ddq_ref = np.clip((v_ref - self._dq_ref) / h, -40.0, 40.0)
+        self._q_ref, self._dq_ref = np.clip(x_ref, self._low, self._high), v_ref
+        self._reason = (
+            "a joint of the slave at its limit: the master points out of its reach"
+            if np.any(self._q_ref != x_ref)
+            else ""
+        )
+        a = ddq_ref + BANDWIDTH**2 * (self._q_ref - seen.q) + 2.0 * BANDWIDTH * (v_ref - seen.dq)
+        torque = self.model.inverse_dynamics(seen.q, v_ref, a)
+        torque = torque + (self._coulomb + LOAD_FRICTION * np.abs(torque)) * np.tanh(v_ref / TURNING)
+        self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (seen.force - self._taken_off)
+        torque = torque - self._taken_off
+        if push is not None:
+            torque = torque + push
+        if self.driver.state != "enabled":
+            return np.zeros(self.axes)
+        return self.driver.write(np.clip(torque, -self._effort, self._effort))
+
+    def true_force(self) -> Array:
+        """(n,) torque of the scene on the joints, from MuJoCo's contacts [N m]."""
+        found: Array = self.model.jacobian(self.plant.q, self.model.grasp)[:3].T @ super().true_force()
+        return found
+
+    def at_tip(self, q: Array, torque: Array) -> Array:
+        """(3,) least force at the tool's tip that is such a torque of the joints (n,) [N]."""
+        found: Array = np.linalg.lstsq(self.model.jacobian(q, self.model.grasp)[:3].T, torque, rcond=None)[
+            0
+        ].astype(np.float64)
+        return found
+
+    def tip(self, q: Array) -> Array:
+        """(3,) place of the tool's tip at a pose (n,) [m]."""
+        return self._pose(q)[1]
+
+
+def joint_path(
+    arm: Arm, q: Array, path: Callable[[float], Array], seconds: float
+) -> Callable[[float], Array]:
+    """The joints' way (n,) [rad] from the start `q` that takes the tool's tip along `path` (3,) [m] from there."""
+    step = 0.01
+    times = np.arange(0.0, seconds + step, step)
+    T = arm.forward_kinematics(q)
+    start = T[:3, :3] @ arm.grasp + T[:3, 3]
+    rows, now = [], q.copy()
+    for time in times:
+        for _ in range(3):
+            T = arm.forward_kinematics(now)
+            J = arm.jacobian(now, arm.grasp)[:3]
+            away = start + path(float(time)) - (T[:3, :3] @ arm.grasp + T[:3, 3])
+            now = now + J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(3), away)
+        rows.append(now - q)
+    ways = np.array(rows)
+
+    def wish(time: float) -> Array:
+        return q + np.array([np.interp(time, times, column) for column in ways.T])
+
+    return wish
