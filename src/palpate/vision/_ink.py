@@ -35,6 +35,8 @@ DARK = 0.5
 PALE = 0.25
 """a wide piece inside the board that takes away less of the light than this, and is darker than what lies around, is a
 smudge, not a thing"""
+PATCH = 12
+"""a pale piece wider than a stroke covers so many of every ninth pixels at least"""
 SPECK = 9
 """smallest connected piece [pixels]"""
 
@@ -53,8 +55,11 @@ class Ink:
     """(len(polygons),) part of the light that the piece takes away, at its core"""
 
 
-def find(image: Image, corners: Array) -> Ink:
-    """Ink in a picture (H, W, 3) within the quadrangle corners (4, 2) [pixels]."""
+def find(image: Image, corners: Array, *, faint: float = FAINT, clear: float = CLEAR) -> Ink:
+    """Ink in a picture (H, W, 3) within the quadrangle corners (4, 2) [pixels].
+
+    `faint` and `clear`: part of the light that the weakest and the core of a stroke take away, at least.
+    """
     height, width = image.shape[:2]
     low = np.clip(np.floor(corners.min(0)).astype(int) - 2, 0, None)
     high = np.minimum(np.ceil(corners.max(0)).astype(int) + 3, [width, height])
@@ -76,12 +81,17 @@ def find(image: Image, corners: Array) -> Ink:
     # the noise: half of a clean surface takes away less than the median, without strokes
     middle = float(np.median(surface))
     noise = 1.4826 * float(np.median(np.abs(surface[surface <= 2.0 * middle + 2.0] - middle)))
-    faint = max(255.0 * FAINT, middle + SIGMAS * noise)
-    clear = max(255.0 * CLEAR, middle + 1.6 * SIGMAS * noise)
-    weak = ((taken > faint) & (below > 255.0 * BELOW) & (inside > 0)).astype(np.uint8)
+    weakest = max(255.0 * faint, middle + SIGMAS * noise)
+    core = max(255.0 * clear, middle + 1.6 * SIGMAS * noise)
+    darker = 255.0 * BELOW * min(1.0, faint / FAINT)
+    weak = ((taken > weakest) & (below > darker) & (inside > 0)).astype(np.uint8)
     things = _things(below, inside, weak, size)
+    patches = _patches(below, inside, weak, things, size, core)
+    if patches is not None:
+        weak |= patches
+        taken = cv2.max(taken, cv2.bitwise_and(below, below, mask=patches))
     ink = _pieces(
-        board, weak, taken, below, things, clear, corners - low, low, (height, width), shorter, edge / 2.0
+        board, weak, taken, below, things, core, corners - low, low, (height, width), shorter, edge / 2.0
     )
     found, _ = cv2.findContours(things, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     solid = tuple(3.0 * f.reshape(-1, 2) + 1.0 + low for f in found)
@@ -102,6 +112,45 @@ def _things(below: Image, inside: Image, weak: Image, size: int) -> Image:
         narrow = np.bincount(names, weak[1::3, 1::3].ravel(), count) / np.bincount(names, minlength=count)
         solid[narrow[label] > 0.8] = 0
     return solid
+
+
+def _patches(below: Image, inside: Image, weak: Image, things: Image, size: int, core: float) -> Image | None:
+    """Pale pieces wider than a stroke, which a closing fills: rests that were wiped about.
+
+    Shadows are as pale and as wide. They fade at their rims or run out of the board, so a patch is what ends within the
+    board in a step all around.
+    """
+    small = cv2.boxFilter(below, -1, (3, 3))[1::3, 1::3]
+    dark = ((small > core) & (inside[1::3, 1::3] > 0)).astype(np.uint8)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size // 6 + 1, size // 6 + 1))
+    solid = cv2.morphologyEx(dark, cv2.MORPH_OPEN, disc)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
+    out = np.zeros_like(solid)
+    near = np.ones((3, 3), np.uint8)
+    height, width = solid.shape
+    for i in range(1, count):
+        x, y, w, h, area = stats[i]
+        window = np.s_[max(0, y - 4) : min(height, y + h + 4), max(0, x - 4) : min(width, x + w + 4)]
+        piece = (label[window] == i).astype(np.uint8)
+        if area < PATCH or np.any(piece & things[window]):
+            continue
+        if np.count_nonzero(piece & weak[1::3, 1::3][window]) > 0.8 * area:
+            continue  # it is found as it is
+        within = cv2.morphologyEx(piece, cv2.MORPH_GRADIENT, near) & piece
+        beyond = cv2.dilate(piece, np.ones((7, 7), np.uint8)) - cv2.dilate(piece, np.ones((5, 5), np.uint8))
+        beyond &= weak[1::3, 1::3][window] ^ 1
+        if np.any(inside[1::3, 1::3][window][beyond > 0] == 0) or not np.any(beyond):
+            continue
+        values = small[window]
+        usual = float(np.median(values[within > 0]))
+        if float(np.percentile(values[beyond > 0], 80)) < 0.5 * usual:
+            out[window] |= piece
+    if not out.any():
+        return None
+    whole = np.zeros_like(weak)
+    grown = cv2.resize(cv2.dilate(out, near), (3 * width, 3 * height), interpolation=cv2.INTER_NEAREST)
+    whole[: grown.shape[0], : grown.shape[1]] = grown[: whole.shape[0], : whole.shape[1]]
+    return cv2.bitwise_and(whole, whole, mask=inside)
 
 
 def _shape(corners: Array) -> float:
@@ -142,10 +191,13 @@ def _darker(board: Image, weak: Image, piece: Mask, box: Array, strength: float)
     x, y, w, h = (int(v) for v in box)
     reach = 2 * max(w, h)
     window = np.s_[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
-    light = board[window].max(2)
-    around = light[(weak[window] == 0) & (light > 0)]
-    usual = float(np.percentile(around, 10)) if around.size else 0.0
-    return float(np.median(light[piece[window]])) < (1.0 - 0.5 * strength) * usual
+    light = board[window]
+    around = light[(weak[window] == 0) & (light.max(2) > 0)]
+    if not len(around):
+        return False
+    # a coloured pen takes its light from some channels only
+    usual = np.percentile(around, 10, axis=0)
+    return bool(np.any(np.median(light[piece[window]], axis=0) < (1.0 - 0.5 * strength) * usual))
 
 
 def _pieces(

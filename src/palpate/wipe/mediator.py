@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
+import shapely
 from statemachine import State, StateMachine
 
 from .. import vision
@@ -24,7 +25,7 @@ from .motion import Path
 from .options import JobOptions
 from .result import Kind, Look, Verdict
 from .slow import Navigation, Perception, Route, Situation, ToGrip, ToPark, ToStrokes
-from .strokes import Plan
+from .strokes import Plan, outlines, shape, swept
 
 SURE = 0.8
 """confidence of a board from which its place is believed"""
@@ -44,6 +45,12 @@ SHAPE = 2.0
 """corners of a board found are so far at most from those of the nearest pose of a board of the right size [pixel]"""
 PATIENCE_NS = 2_000_000_000
 """for a torque channel to come back [ns]"""
+LEFT = 0.005
+"""part of the ink's area that may be left on a clean board"""
+SAME_PLACE = 0.004
+"""rests lie so near the ink they are left of [m]"""
+STAIN, STAYS = 0.06, 0.8
+"""a mark that takes away less than this part of the light, and so much of it after the eraser was there, is no ink"""
 CALM_NS = 400_000_000
 """at rest after a fault before anything moves; a channel must be well for so long [ns]"""
 
@@ -114,6 +121,24 @@ class Mission(StateMachine):
     )
 
 
+@dataclass(slots=True, eq=False)
+class Memory:
+    """What a job knows of its board, however often it is stopped and goes on."""
+
+    number: int = 0
+    """passes that were begun"""
+    broken: bool = False
+    """the last one was broken off in its middle"""
+    first: Choice | None = None
+    """what was to be wiped, and what was to stay, before the first pass"""
+    marks: list[tuple[Any, float]] = field(default_factory=list)
+    """ink as it was seen before the last pass (shapely, board coordinates), and how much light its core took away"""
+    wiped: Any = None
+    """where the eraser has been (shapely, board coordinates)"""
+    stains: list[Any] = field(default_factory=list)
+    """marks that do not come off (shapely)"""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Others:
     """The activities that the mediator tells what to do, and what it knows of the cell."""
@@ -175,6 +200,10 @@ def displacement(reference: Look, now: Look) -> float | None:
     return None
 
 
+def _area(polygons: Iterable[Array]) -> float:
+    return float(shapely.union_all([shape(p, "ink") for p in polygons]).area)
+
+
 class Mediator(Activity):
     """Sees to it that a board gets clean.
 
@@ -184,8 +213,7 @@ class Mediator(Activity):
         others: the activities it tells what to do.
         tell: called with what happened.
         passed: called when a pass has begun, is halted, goes on or is done.
-        number: passes that were made before.
-        broken: the last one was broken off.
+        memory: of what was done before; it is kept up to date.
     """
 
     def __init__(
@@ -195,8 +223,7 @@ class Mediator(Activity):
         others: Others,
         tell: Callable[[Kind, str], None],
         passed: Callable[[str, Plan | None, float], None],
-        number: int,
-        broken: bool,
+        memory: Memory,
     ) -> None:
         super().__init__("mediator", period_ns)
         self.mission = Mission()
@@ -204,7 +231,7 @@ class Mediator(Activity):
         self.verdict: Verdict = "stopped"
         self.reason = ""
         self.resumable = False
-        self.number = number
+        self.memory = memory
         self.T_base_board: Array | None = None
         self.looks: list[Look] = []
         self.wipe: Wipe | None = None
@@ -219,9 +246,13 @@ class Mediator(Activity):
         self._choice: Choice | None = None
         self._reference: Look
         self._hand: Array | None = None
-        self._broken = broken  # off in the middle of a pass
         self._loose = True  # as far as is known the board stays where it is by itself
         self._checked = 0
+
+    @property
+    def number(self) -> int:
+        """Passes that were begun."""
+        return self.memory.number
 
     # -- from outside ----------------------------------------------------------
 
@@ -266,7 +297,7 @@ class Mediator(Activity):
         self._cause, self.reason = cause, text
         self._tell("person" if cause == "other" else "fault", text)
         if self.task == "wiping":
-            self._broken = True
+            self.memory.broken, self.memory.wiped = True, None
             self._passed("halted", None, 0.0)
         self._go("fail")
 
@@ -334,7 +365,7 @@ class Mediator(Activity):
     _now = 0
 
     def _looking(self) -> None:
-        look = self._look("after" if self.looks else "before")
+        look = self._look("before" if self.memory.first is None else "after")
         if look is None:
             return
         self.looks.append(look)
@@ -374,24 +405,66 @@ class Mediator(Activity):
         self._plan_or_end(look)
 
     def _plan_or_end(self, look: Look) -> None:
-        o = self._options
-        self._choice = choose(
-            look.sight.ink_polygons,
-            colours=ink_colours(look.image, look.sight) if o.colour is not None else None,
-            colour=o.colour,
-            within=o.within,
-            without=o.without,
-            objects=look.sight.object_polygons,
-        )
-        if not self._choice.wipe:
+        o, memory = self._options, self.memory
+        choice = self._choice = self._chosen(look)
+        memory.first = memory.first or choice
+        if not choice.wipe:
             self._finish("clean", "")
-        elif self.number >= o.passes and not self._broken:
-            left = f"{1e2 * look.sight.covered:.2g} % of the board"
-            self._finish("dirty", f"after {self.number} passes ink is still seen on {left}")
+        elif memory.number >= o.passes and not memory.broken:
+            left = _area(choice.wipe) / _area(memory.first.wipe)
+            passes = f"{memory.number} {'pass' if memory.number == 1 else 'passes'}"
+            if left <= LEFT:
+                self._tell("board", f"after {passes} no more than {1e2 * LEFT:g} % of the ink's area is seen")
+                self._finish("clean", "")
+            else:
+                self._finish("dirty", f"after {passes} {1e2 * left:.2g} % of the ink's area is still seen")
         elif not self._others.robot.held and (o.hold == "always" or (o.hold == "needed" and not self._loose)):
             self._go("hold")
         else:
             self._go("think")
+
+    def _chosen(self, look: Look) -> Choice:
+        """What of the ink that is seen is to be wiped."""
+        o, memory, sight = self._options, self.memory, look.sight
+        assert sight.ink is not None
+        pieces = [
+            (shape(p, "ink"), float(c)) for p, c in zip(sight.ink_polygons, sight.ink.contrast, strict=True)
+        ]
+        found = len(memory.stains)
+        if memory.wiped is not None:
+            memory.stains += [
+                p
+                for p, c in pieces
+                if c < STAIN
+                and memory.wiped.contains(p)
+                and any(c > STAYS * before and p.intersects(q) for q, before in memory.marks)
+            ]
+        memory.wiped = None
+        count = len(memory.stains) - found
+        if count:
+            marks = "a faint mark that does" if count == 1 else f"{count} faint marks that do"
+            self._tell("board", f"{marks} not come off: taken for the surface's own")
+        memory.marks = pieces
+        stained = shapely.union_all(memory.stains).buffer(SAME_PLACE) if memory.stains else None
+        ink = [p for p in sight.ink_polygons if stained is None or not stained.contains(shape(p, "ink"))]
+        if o.colour is None or memory.first is None:
+            return choose(
+                ink,
+                colours=ink_colours(look.image, look.sight) if o.colour is not None else None,
+                colour=o.colour,
+                within=o.within,
+                without=o.without,
+                objects=look.sight.object_polygons,
+            )
+        # the colour of a rest cannot be told; its place tells what it is left of
+        goes = shapely.union_all([shape(p, "ink") for p in memory.first.wipe]).buffer(SAME_PLACE)
+        stays = shapely.union_all([shape(p, "ink") for p in memory.first.keep])
+        rests = choose(
+            [r for p in ink for r in outlines(shape(p, "ink").intersection(goes).difference(stays))],
+            within=o.within,
+            without=o.without,
+        )
+        return Choice(rests.wipe, (*memory.first.keep, *look.sight.object_polygons))
 
     def _look(self, why: str) -> Look | None:
         if not self._asked:
@@ -456,9 +529,19 @@ class Mediator(Activity):
             self._finish("dirty", text)
             return
         if route.plan is not None and route.plan.left:
-            self._tell("task", f"{len(route.plan.left)} places are out of the eraser's reach")
-        self.number += not self._broken  # a pass that was broken off goes on
-        self._broken = False
+            count = len(route.plan.left)
+            places = "a place is" if count == 1 else f"{count} places are"
+            self._tell("task", f"{places} out of the eraser's reach")
+        memory = self.memory
+        memory.number += not memory.broken  # a pass that was broken off goes on
+        memory.broken = False
+        if route.plan is not None:
+            ways = [
+                swept(a, b, route.plan.footprint)
+                for s in route.plan.strokes
+                for a, b in itertools.pairwise(s)
+            ]
+            memory.wiped = shapely.union_all(ways)
         self._route_now = route
         self._go("move")
         self._paths.extend((0, p) for p in route.paths)
@@ -481,7 +564,8 @@ class Mediator(Activity):
         seen = self.looks[-1].sight.covered
         self._passed("begun", route.plan, seen)
         strokes = len(route.plan.strokes) if route.plan is not None else 0
-        self._tell("task", f"pass {self.number}: {strokes} strokes, about {self.wipe.total:.0f} s")
+        many = "1 stroke" if strokes == 1 else f"{strokes} strokes"
+        self._tell("task", f"pass {self.number}: {many}, about {self.wipe.total:.0f} s")
 
     def _begin_wiping(self) -> None:
         assert self.wipe is not None
@@ -535,7 +619,7 @@ class Mediator(Activity):
                 self.wipe.resume()
                 self._well = 0
                 self._cause = ""
-                self._broken = False
+                self.memory.broken = False
                 self._go("wipe")
                 self._passed("resumed", None, 0.0)
                 self._begin_wiping()

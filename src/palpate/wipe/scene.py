@@ -44,6 +44,10 @@ STIFFNESS = 600.0
 """of the whole felt [N/m]"""
 TRAVEL = 0.012
 """of a pad [m]"""
+WHITE = 0.85
+"""part of the light that the clean surface gives back, so that the cell's lamps do not burn it out"""
+BRIGHT = 240.0
+"""the camera's exposure keeps all but a hundredth of the picture below this, of 255"""
 MAGNET = (0.014, 0.009)
 """radius and height of a magnet [m]"""
 GRIP = 0.012
@@ -453,6 +457,8 @@ class BoardScene:
     def look(self) -> npt.NDArray[np.uint8]:
         """A picture (H, W, 3) BGR with blur, noise and a light that is never quite the same.
 
+        Like any camera's, its exposure keeps what is bright from burning out.
+
         Raises:
             PalpateError: no OpenGL on this machine.
         """
@@ -465,6 +471,7 @@ class BoardScene:
         rgb = self._shown(self._lens)
         gain = np.exp(s.lamps * rng.standard_normal()) * np.exp(0.2 * s.lamps * rng.standard_normal(3))
         light = rgb[..., ::-1].astype(np.float32) * gain.astype(np.float32)
+        light *= min(1.0, BRIGHT / max(float(np.percentile(light[::4, ::4].max(2), 99.0)), 1.0))
         if s.blur > 0.0:
             light = cv2.GaussianBlur(light, (0, 0), s.blur)
         if s.noise > 0.0:
@@ -587,7 +594,7 @@ class BoardScene:
             height=rows,
             builtin=mj.mjtBuiltin.mjBUILTIN_FLAT,  # the ink comes with each picture
         )
-        material = spec.add_material(name="ink", specular=0.2, shininess=0.6)
+        material = spec.add_material(name="ink", specular=0.2, shininess=0.6, rgba=(*(3 * (WHITE,)), 1.0))
         textures = list(material.textures)
         textures[mj.mjtTextureRole.mjTEXROLE_RGB] = "ink"
         material.textures = textures

@@ -7,7 +7,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -18,7 +18,8 @@ from ..arm import Array
 from .activity import Activity, Slot
 from .fast import Work
 from .motion import Path, find
-from .reach import inverse_kinematics, reachable, tool_poses
+from .options import JobOptions
+from .reach import inverse_kinematics, paced, reachable, tool_poses
 from .result import Look
 from .scene import FRAME, THICK, BoardScene
 from .strokes import Eraser, Motion, Plan, plan
@@ -34,6 +35,11 @@ BACK = 0.08
 """way of the gripper's fingers towards the rim [m]"""
 
 
+FRAMES = 8
+"""pictures of which the mean is looked at"""
+FAINT, CLEAR = 0.012, 0.02
+"""part of the light that the weakest and the core of what is left of ink take away, at least: a twentieth of a layer of
+ink takes 0.04, half of it where it is no wider than a pixel"""
 FREE = 0.003
 """a hand about to take the board keeps so far from everything [m]"""
 TURN = 0.6
@@ -59,7 +65,7 @@ class Slow(Activity, Generic[Question, Answer]):
             self._coming = None
         if self.state != "running":
             return
-        question = self.question.take()
+        question = self.ready()
         if question is None:
             return
         think = self.thinking(time_ns, question)
@@ -67,6 +73,10 @@ class Slow(Activity, Generic[Question, Answer]):
             self.answer.put(think())
         else:
             self._coming = self._pool.submit(think)
+
+    def ready(self) -> Question | None:
+        """A question for which everything is there."""
+        return self.question.take()
 
     @abstractmethod
     def thinking(self, time_ns: int, question: Question) -> Callable[[], Answer]:
@@ -79,19 +89,43 @@ class Slow(Activity, Generic[Question, Answer]):
 
 
 class Perception(Slow[str, Look]):
-    """Takes a picture and looks for the board and the ink; the question is what the picture is for."""
+    """Takes pictures and looks for the board and the ink; the question is what they are for.
+
+    With the arms out of the way (before, after) it takes FRAMES of them, one in each cycle, and looks at their mean;
+    after wiping for whatever ink could be told from the surface. A check is one picture.
+    """
 
     def __init__(self, scene: BoardScene, period_ns: int, threaded: bool) -> None:
         super().__init__("perception", period_ns, threaded)
         self._scene = scene
         self._camera = scene.camera
+        self._why: str | None = None
+        self._frames: list[npt.NDArray[np.uint8]] = []
+
+    def ready(self) -> str | None:
+        """A picture in each cycle, until there are enough for what they are for."""
+        question = self.question.take()
+        if question is not None:
+            self._why, self._frames = question, []
+        if self._why is None:
+            return None
+        self._frames.append(self._scene.look())
+        if self._why != "check" and len(self._frames) < FRAMES:
+            return None
+        why, self._why = self._why, None
+        return why
 
     def thinking(self, time_ns: int, question: str) -> Callable[[], Look]:
-        """The picture now; what is in it later."""
-        image = self._scene.look()
+        """What is in the pictures, later."""
+        frames, size = self._frames, self._scene.ink.size
 
         def see() -> Look:
-            sight = vision.see(image, size=self._scene.ink.size, camera=self._camera)
+            mean = vision.average(frames)
+            image = frames[-1] if mean is None else mean  # something moved in front of the camera
+            sight = vision.see(image, size=size, camera=self._camera)
+            if question == "after" and sight.board is not None:
+                rests = vision.ink(image, sight.board.corners, faint=FAINT, clear=CLEAR)
+                sight = replace(sight, ink=rests)
             return Look(time_ns, image, sight, question)
 
         return see
@@ -149,12 +183,13 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
         scene: BoardScene,
         period_ns: int,
         threaded: bool,
-        motion: Motion,
-        eraser: Eraser,
+        options: JobOptions,
         home: tuple[Array, Array],
     ) -> None:
         super().__init__("navigation", period_ns, threaded)
-        self._scene, self._motion, self._eraser, self._home = scene, motion, eraser, home
+        self._scene, self._options, self._home = scene, options, home
+        self._motion: Motion = options.motions
+        self._eraser: Eraser = replace(scene.eraser, rub=options.rub)
 
     def thinking(self, time_ns: int, question: ToStrokes | ToGrip | ToPark) -> Callable[[], Route]:
         """All of it later."""
@@ -205,7 +240,16 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
         path = self._way(0, now, reach.q[0])
         if path is None:
             return Route(reason="there is no clear way for the arm to the board", plan=strokes)
-        legs = strokes.legs
+        o = self._options
+        legs = paced(
+            arm,
+            strokes,
+            reach,
+            now.T_base_board,
+            max_force=o.max_force,
+            max_torque=o.max_torque,
+            normal_force=o.normal_force,
+        )
         number = itertools.accumulate(leg.phase == "touch" for leg in legs)
         work = Work(
             legs,

@@ -1,0 +1,51 @@
+"""Several pictures of the same view made into one with less noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import InputError
+from ._image import Image, checked
+
+CELL = 8
+"""pictures are compared in squares of so many pixels"""
+STILL = 0.06
+"""change of a square's brightness, the light's own taken away, from which something moved"""
+
+
+def average(pictures: Sequence[npt.ArrayLike]) -> Image | None:
+    """The mean (H, W, 3) BGR of pictures from a camera at rest; None: something moved between them.
+
+    Light and exposure may change from picture to picture: each is first brought to the light of the brightest, channel
+    by channel. N pictures have 1/sqrt(N) of the noise of one.
+
+    Args:
+        pictures: each (H, W, 3) BGR, (H, W) grey or (H, W, 4), uint8, all of one size.
+
+    Raises:
+        InputError: no picture, not a picture, pictures of different sizes.
+    """
+    views = [checked(p) for p in pictures]
+    if not views:
+        raise InputError("average: at least one picture is needed")
+    if any(v.shape != views[0].shape for v in views):
+        raise InputError(f"average: pictures must be of one size, got {sorted({v.shape for v in views})}")
+    height, width = views[0].shape[:2]
+    size = (max(1, width // CELL), max(1, height // CELL))
+    small = [cv2.resize(v, size, interpolation=cv2.INTER_AREA).astype(np.float32) + 1.0 for v in views]
+    first = max(small, key=lambda s: float(np.median(s)))
+    total = np.zeros(views[0].shape, np.float32)
+    for view, cells in zip(views, small, strict=True):
+        ratio = first / cells
+        gain = np.median(ratio, axis=(0, 1))
+        # what burnt out in one of them tells nothing
+        told = (np.maximum(first, cells) < 250.0) & (np.minimum(first, cells) > 12.0)
+        if np.any(np.abs(np.log(ratio / gain))[told] > STILL):
+            return None
+        total += cv2.multiply(view, (*gain.tolist(), 0.0), dtype=cv2.CV_32F)
+    mean: Image = np.clip(np.rint(total / len(views)), 0, 255).astype(np.uint8)
+    return mean
