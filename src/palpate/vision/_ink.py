@@ -8,6 +8,7 @@ the surface's usual level around it, which ink falls below and a gap does not.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -80,7 +81,9 @@ def find(image: Image, corners: Array, *, faint: float = FAINT, clear: float = C
         return Ink(np.zeros((height, width), bool), (), (), np.zeros(0))
     # the noise: half of a clean surface takes away less than the median, without strokes
     middle = float(np.median(surface))
-    noise = 1.4826 * float(np.median(np.abs(surface[surface <= 2.0 * middle + 2.0] - middle)))
+    away = np.abs(surface[surface <= 2.0 * middle + 2.0] - middle)
+    # the median distance of whole numbers is 0 or 1 where there is little noise; the mean one is finer
+    noise = max(1.4826 * float(np.median(away)), math.sqrt(0.5 * math.pi) * float(np.mean(away)))
     weakest = max(255.0 * faint, middle + SIGMAS * noise)
     core = max(255.0 * clear, middle + 1.6 * SIGMAS * noise)
     darker = 255.0 * BELOW * min(1.0, faint / FAINT)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ._image import Image, checked
+from ._image import Image, Mask, checked
 
 CELL = 8
 """pictures are compared in squares of so many pixels"""
@@ -17,11 +17,11 @@ STILL = 0.06
 """change of a square's brightness, the light's own taken away, from which something moved"""
 
 
-def average(pictures: Sequence[npt.ArrayLike]) -> Image | None:
-    """The mean (H, W, 3) BGR of pictures from a camera at rest; None: something moved between them.
+def average(pictures: Sequence[npt.ArrayLike]) -> tuple[Image, Mask]:
+    """The mean (H, W, 3) BGR of pictures from a camera at rest, and a mask (H, W) of what moved between them.
 
     Light and exposure may change from picture to picture: each is first brought to the light of the brightest, channel
-    by channel. N pictures have 1/sqrt(N) of the noise of one.
+    by channel. N pictures have 1/sqrt(N) of the noise of one. Where something moved, the last picture is given.
 
     Args:
         pictures: each (H, W, 3) BGR, (H, W) grey or (H, W, 4), uint8, all of one size.
@@ -39,13 +39,18 @@ def average(pictures: Sequence[npt.ArrayLike]) -> Image | None:
     small = [cv2.resize(v, size, interpolation=cv2.INTER_AREA).astype(np.float32) + 1.0 for v in views]
     first = max(small, key=lambda s: float(np.median(s)))
     total = np.zeros(views[0].shape, np.float32)
+    moved = np.zeros(small[0].shape[:2], bool)
     for view, cells in zip(views, small, strict=True):
         ratio = first / cells
         gain = np.median(ratio, axis=(0, 1))
         # what burnt out in one of them tells nothing
         told = (np.maximum(first, cells) < 250.0) & (np.minimum(first, cells) > 12.0)
-        if np.any(np.abs(np.log(ratio / gain))[told] > STILL):
-            return None
-        total += cv2.multiply(view, (*gain.tolist(), 0.0), dtype=cv2.CV_32F)
-    mean: Image = np.clip(np.rint(total / len(views)), 0, 255).astype(np.uint8)
-    return mean
+        moved |= ((np.abs(np.log(ratio / gain)) > STILL) & told).any(2)
+        now = cv2.multiply(view, (*gain.tolist(), 0.0), dtype=cv2.CV_32F)
+        total += now
+    total /= len(views)
+    where: Mask = cv2.resize(moved.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    if where.any():
+        total[where] = now[where]
+    mean: Image = cv2.convertScaleAbs(total)  # rounds and keeps to 255
+    return mean, where

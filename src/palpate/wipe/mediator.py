@@ -15,7 +15,7 @@ import shapely
 from statemachine import State, StateMachine
 
 from .. import vision
-from .._core import AbagParameters, CartesianVelocityOptions
+from .._core import AbagParameters, CartesianVelocityOptions, Posture
 from ..arm import Arm, Array
 from ..control import CartesianVelocity
 from .activity import Activity, Slot
@@ -24,7 +24,7 @@ from .fast import Control, Estimation, Follow, Hold, Law, Robot, Wipe
 from .motion import Path
 from .options import JobOptions
 from .result import Kind, Look, Verdict
-from .slow import Navigation, Perception, Route, Situation, ToGrip, ToPark, ToStrokes
+from .slow import Navigation, Perception, Route, Situation, ToBring, ToGrip, ToPark, ToStrokes
 from .strokes import Plan, outlines, shape, swept
 
 SURE = 0.8
@@ -78,6 +78,8 @@ GAINS: Mapping[str, Any] = {
     ),
     "turning": 8.0,
     "approach": 5.0,
+    # the elbow drifts; a joint at its limit of speed would be braked, and the tool with it
+    "posture": Posture(damping=4.0, largest=3.0),
 }
 
 Cause: TypeAlias = Literal["", "torque", "contact", "hand", "other"]
@@ -90,14 +92,16 @@ class Mission(StateMachine):
     looking = State()
     holding = State()
     planning = State()
+    bringing = State()
     moving = State()
     wiping = State()
     safe = State()
     releasing = State()
     ended = State(final=True)
 
-    look = parking.to(looking) | holding.to(looking)
-    hold = looking.to(holding)
+    look = parking.to(looking) | holding.to(looking) | bringing.to(looking)
+    hold = looking.to(holding) | planning.to(holding)
+    bring = planning.to(bringing)
     think = looking.to(planning) | holding.to(planning)
     move = planning.to(moving)
     wipe = moving.to(wiping) | safe.to(wiping)
@@ -107,14 +111,16 @@ class Mission(StateMachine):
         | looking.to(safe)
         | holding.to(safe)
         | planning.to(safe)
+        | bringing.to(safe)
         | moving.to(safe)
         | wiping.to(safe)
     )
-    release = looking.to(releasing) | planning.to(releasing)
+    release = looking.to(releasing) | planning.to(releasing) | bringing.to(releasing)
     end = (
         looking.to(ended)
         | planning.to(ended)
         | holding.to(ended)
+        | bringing.to(ended)
         | safe.to(ended)
         | releasing.to(ended)
         | parking.to(ended)
@@ -200,6 +206,13 @@ def displacement(reference: Look, now: Look) -> float | None:
     return None
 
 
+def _marks(count: int) -> str:
+    if not count:
+        return ""
+    marks = "a faint mark that does" if count == 1 else f"{count} faint marks that do"
+    return f"but for {marks} not come off, taken for the surface's own"
+
+
 def _area(polygons: Iterable[Array]) -> float:
     return float(shapely.union_all([shape(p, "ink") for p in polygons]).area)
 
@@ -242,7 +255,9 @@ class Mediator(Activity):
         self._asked = False
         self._paths: deque[tuple[int, Path]] = deque()
         self._law: tuple[int, Law] | None = None
-        self._tries = self._grips = self._again = self._doubts = 0
+        self._tries = self._grips = self._again = self._doubts = self._brought = 0
+        self._unreachable = self._refused = ""
+        self._stopping = False
         self._choice: Choice | None = None
         self._reference: Look
         self._hand: Array | None = None
@@ -262,6 +277,9 @@ class Mediator(Activity):
 
     def stop(self, why: str) -> None:
         """Come to a safe end."""
+        if self._stopping:
+            return
+        self._stopping = True
         if self.task not in ("safe", "ended", "releasing"):
             self._halt("other", why)
         elif self.task == "safe":
@@ -304,7 +322,7 @@ class Mediator(Activity):
     def _finish(self, verdict: Verdict, reason: str, *, resumable: bool = False) -> None:
         self.verdict, self.reason, self.resumable = verdict, reason, resumable
         held = self._others.robot.held
-        if held and verdict != "stopped" and self.task in ("looking", "planning"):
+        if held and verdict != "stopped" and self.task in ("looking", "planning", "bringing"):
             self._others.robot.grip.put(False)
             self._go("release")
         else:
@@ -316,7 +334,7 @@ class Mediator(Activity):
         T = self.T_base_board
         return Situation(felt.q, self._others.nominal if T is None else T)
 
-    def _route(self, question: ToStrokes | ToGrip | ToPark) -> Route | None:
+    def _route(self, question: ToStrokes | ToGrip | ToBring | ToPark) -> Route | None:
         """Ask once; the answer when it is there."""
         if not self._asked:
             self._asked = True
@@ -409,7 +427,7 @@ class Mediator(Activity):
         choice = self._choice = self._chosen(look)
         memory.first = memory.first or choice
         if not choice.wipe:
-            self._finish("clean", "")
+            self._finish("clean", _marks(len(memory.stains)))
         elif memory.number >= o.passes and not memory.broken:
             left = _area(choice.wipe) / _area(memory.first.wipe)
             passes = f"{memory.number} {'pass' if memory.number == 1 else 'passes'}"
@@ -430,7 +448,6 @@ class Mediator(Activity):
         pieces = [
             (shape(p, "ink"), float(c)) for p, c in zip(sight.ink_polygons, sight.ink.contrast, strict=True)
         ]
-        found = len(memory.stains)
         if memory.wiped is not None:
             memory.stains += [
                 p
@@ -440,10 +457,6 @@ class Mediator(Activity):
                 and any(c > STAYS * before and p.intersects(q) for q, before in memory.marks)
             ]
         memory.wiped = None
-        count = len(memory.stains) - found
-        if count:
-            marks = "a faint mark that does" if count == 1 else f"{count} faint marks that do"
-            self._tell("board", f"{marks} not come off: taken for the surface's own")
         memory.marks = pieces
         stained = shapely.union_all(memory.stains).buffer(SAME_PLACE) if memory.stains else None
         ink = [p for p in sight.ink_polygons if stained is None or not stained.contains(shape(p, "ink"))]
@@ -477,11 +490,13 @@ class Mediator(Activity):
 
     def _holding(self) -> None:
         if self._law is None and not self._paths and self._hand is None:
-            route = self._route(ToGrip(self._situation()))
+            assert self._choice is not None
+            route = self._route(ToGrip(self._situation(), self._choice.wipe, self._choice.keep))
             if route is None:
                 return
             if route.reason:
                 if self._loose:
+                    self._refused = route.reason
                     self._tell("board", f"{route.reason}; the board stays loose")
                     self._go("think")
                 else:
@@ -522,7 +537,16 @@ class Mediator(Activity):
         if route is None:
             return
         if route.reason:
-            self._finish("stopped", route.reason)
+            self._unreachable = route.reason
+            if route.plan is None or not route.plan.strokes or self._brought >= LOOKS:
+                self._finish("stopped", route.reason)
+            elif self._others.robot.held:
+                self._brought += 1
+                self._go("bring")
+            elif self._options.hold == "never" or self._refused:
+                self._finish("stopped", f"{route.reason}; {self._refused or 'no arm may take the board'}")
+            else:
+                self._go("hold")
             return
         if route.work is None:
             text = "what is left is too near to something that is to be left alone"
@@ -547,6 +571,30 @@ class Mediator(Activity):
         self._paths.extend((0, p) for p in route.paths)
 
     _route_now = Route()
+
+    def _bringing(self) -> None:
+        """The other arm takes the board to where the eraser reaches; then it is looked at again."""
+        if not self._parked:
+            assert self._choice is not None
+            route = self._route(ToBring(self._situation(), self._choice.wipe, self._choice.keep))
+            if route is None:
+                return
+            if route.reason:
+                self._finish("stopped", f"{self._unreachable}; {route.reason}")
+                return
+            self._paths.extend((1, p) for p in route.paths)
+            self._parked = True
+            where = "nearer to the eraser's arm" if route.away < 0.0 else "away from the eraser's arm"
+            self._tell(
+                "board",
+                f"{self._unreachable}; the other arm brings the board {1e2 * abs(route.away):.0f} cm {where}",
+            )
+        if not self._went():
+            return
+        self._others.control.orders[1].put(Hold(self._others.arms[1], 1))
+        self._hand, self.T_base_board = self._holder_hand(), None
+        self._go("look")
+        self._tries = 0
 
     def _moving(self) -> None:
         if not self._went():

@@ -331,6 +331,28 @@ class BoardScene:
                     least = min(least, mj.mj_geomDistance(model, d, int(a), int(b), least, None))
         return least
 
+    def stands(self, T_world_board: npt.ArrayLike) -> bool:
+        """A board in this pose (4, 4) would stand on the table with all its feet."""
+        R, centre = self._table
+        W, H = self.ink.size
+        T = np.asarray(T_world_board, dtype=np.float64)
+        feet = np.array(
+            [
+                [0.5 * W + a * x, 0.5 * H + b * y, 0.0]
+                for a in (-1, 1)
+                for b in (-1, 1)
+                for x, y in [self._feet]
+            ]
+        )
+        spots = (feet @ T[:3, :3].T + T[:3, 3] - centre) @ R
+        return bool(np.all(np.abs(spots[:, :2]) < np.array(_tabletop(W, H)) - FOOT))
+
+    @property
+    def _feet(self) -> tuple[float, float]:
+        """From the board's middle to its feet [m]."""
+        W, H = self.ink.size
+        return 0.85 * (0.5 * W + FRAME), 0.85 * (0.5 * H + FRAME)
+
     # -- what people and hands do ----------------------------------------------
 
     def close_grip(self) -> bool:
@@ -546,7 +568,7 @@ class BoardScene:
         spec.worldbody.add_geom(
             name="table",
             type=box,
-            size=(0.55 * W + 0.1, 0.55 * H + 0.1, 0.02),
+            size=(*_tabletop(W, H), 0.02),
             pos=top + R @ [0.0, 0.0, 0.02],
             quat=_model.quaternion(R),
             rgba=(0.55, 0.42, 0.3, 1.0),
@@ -566,12 +588,12 @@ class BoardScene:
             contype=0,
             conaffinity=1 | 2,
         )
-        for a in (-0.85, 0.85):
-            for b in (-0.85, 0.85):
+        for a in (-1.0, 1.0):
+            for b in (-1.0, 1.0):
                 board.add_geom(
                     type=sphere,
                     size=(FOOT, 0.0, 0.0),
-                    pos=(a * outer[0], b * outer[1], THICK + FOOT),
+                    pos=(a * self._feet[0], b * self._feet[1], THICK + FOOT),
                     mass=0.0,
                     contype=4,
                     conaffinity=0,
@@ -780,6 +802,11 @@ def _table(s: Setting) -> tuple[Array, Array]:
     c, k = math.cos(s.tilt), math.sin(s.tilt)
     R = np.array([[c, 0.0, -k], [0.0, 1.0, 0.0], [k, 0.0, c]]) @ flat
     return R, np.array(s.centre, dtype=np.float64)
+
+
+def _tabletop(width: float, height: float) -> tuple[float, float]:
+    """Half its sides under a board of this size [m]."""
+    return 0.55 * width + 0.1, 0.55 * height + 0.1
 
 
 def _holder_base() -> Array:
