@@ -40,6 +40,8 @@ PATCH = 12
 """a pale piece wider than a stroke covers so many of every ninth pixels at least"""
 SPECK = 9
 """smallest connected piece [pixels]"""
+GRAIN = 0.05
+"""a piece whose core takes away less of the light is larger in proportion: dust and grain are single pixels"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +248,12 @@ def _pieces(
     last = np.array(around.shape[::-1]) - 1
     at = np.minimum(points // 3, last)
     beside = np.add.reduceat(around[at[:, 1], at[:, 0]].astype(np.float32), begin) > 0.3 * area
-    good = (hits >= np.maximum(3.0, 0.1 * area)) & (area >= SPECK) & ~rim & ~beside
+    good = (
+        (hits >= np.maximum(3.0, 0.1 * area))
+        & (area >= SPECK * np.maximum(1.0, GRAIN / np.maximum(strength, 1e-3)))
+        & ~rim
+        & ~beside
+    )
     wide = THING * shorter + 1.5
     outlines, filled = {}, np.zeros(len(good))
     for i in np.flatnonzero(good):
