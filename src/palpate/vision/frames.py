@@ -13,8 +13,8 @@ from ._image import Image, Mask, checked
 
 CELL = 8
 """pictures are compared in squares of so many pixels"""
-STILL = 0.06
-"""change of a square's brightness, the light's own taken away, from which something moved"""
+STILL, GRAIN = 0.06, 3.0
+"""part by which a square changes, the light's own change taken away, if something moved, and so much more of 255"""
 
 
 def average(pictures: Sequence[npt.ArrayLike]) -> tuple[Image, Mask]:
@@ -44,8 +44,8 @@ def average(pictures: Sequence[npt.ArrayLike]) -> tuple[Image, Mask]:
         ratio = first / cells
         gain = np.median(ratio, axis=(0, 1))
         # what burnt out in one of them tells nothing
-        told = (np.maximum(first, cells) < 250.0) & (np.minimum(first, cells) > 12.0)
-        moved |= ((np.abs(np.log(ratio / gain)) > STILL) & told).any(2)
+        told = np.maximum(first, cells) < 250.0
+        moved |= ((np.abs(first - gain * cells) > STILL * first + GRAIN) & told).any(2)
         now = cv2.multiply(view, (*gain.tolist(), 0.0), dtype=cv2.CV_32F)
         total += now
     total /= len(views)
