@@ -36,6 +36,8 @@ DARK = 0.5
 PALE = 0.25
 """a wide piece inside the board that takes away less of the light than this, and is darker than what lies around, is a
 smudge, not a thing"""
+EVEN = 0.11
+"""standard deviation within a thing of what it takes away, relative to it: letters on a smudge make one filled piece"""
 PATCH = 12
 """a pale piece wider than a stroke covers so many of every ninth pixels at least"""
 SPECK = 9
@@ -255,7 +257,7 @@ def _pieces(
         & ~beside
     )
     wide = THING * shorter + 1.5
-    outlines, filled = {}, np.zeros(len(good))
+    outlines, filled, uneven = {}, np.zeros(len(good)), np.zeros(len(good))
     for i in np.flatnonzero(good):
         x, y, w, h = stats[i + 1, :4]
         piece = (label[y : y + h, x : x + w] == i + 1).astype(np.uint8)
@@ -268,16 +270,25 @@ def _pieces(
             core = 0.6 * float(np.percentile(dark[piece > 0], 90))
             solid = cv2.findNonZero(piece * (dark > core).astype(np.uint8))
             filled[i] = len(solid) / max(cv2.contourArea(cv2.convexHull(solid)), 1.0)
+            inner = cv2.erode(
+                piece * (dark > core).astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0
+            )
+            if inner.any():
+                level, spread = cv2.meanStdDev(dark, mask=inner)
+                uneven[i] = float(spread[0, 0] / max(level[0, 0], 1.0))
     # half of the ink is in pieces at most so thick; a filled piece tells nothing of a pen's width
     drawn = np.flatnonzero(good & (filled < 0.6))
     drawn = drawn[np.argsort(radius[drawn], kind="stable")]
     mass = np.cumsum(area[drawn])
     pen = float(radius[drawn[np.searchsorted(mass, 0.5 * mass[-1])]]) if len(drawn) else 0.0
     # a magnet, a sticker, an eraser, a hand: as wide as no stroke, and filled or reaching in from outside
-    broad = radius > np.maximum(wide, 1.8 * pen)
     bold = filled > 0.9
+    # where letters run together a pen seems thick, but what is round and much wider than a stroke is no letter
+    compact = bold & (area < 2.2 * np.pi * radius**2) & (radius > 1.5 * wide)
+    broad = radius > np.maximum(wide, np.where(compact, 1.2, 1.8) * pen)
     for i in np.flatnonzero(good & broad & bold & (strength < PALE)):
         bold[i] = not _darker(board, weak, label == i + 1, stats[i + 1, :4], float(strength[i]))
+    bold &= (strength < PALE) | (uneven < EVEN) | (radius > 3.0 * wide)
     thing = broad & (bold | (nearest < margin + 3.0))
     polygons, objects, contrast = [], [], []
     for i, (piece, line) in outlines.items():
