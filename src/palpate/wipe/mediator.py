@@ -51,6 +51,8 @@ SAME_PLACE = 0.004
 """rests lie so near the ink they are left of [m]"""
 STAIN, STAYS = 0.06, 0.8
 """a mark that takes away less than this part of the light, and so much of it after the eraser was there, is no ink"""
+NEAR = "what is left is too near to something that is to be left alone, or to a corner of the board"
+"""why it ends dirty before the passes are used up"""
 CALM_NS = 400_000_000
 """at rest after a fault before anything moves; a channel must be well for so long [ns]"""
 
@@ -141,6 +143,8 @@ class Memory:
     """ink as it was seen before the last pass (shapely, board coordinates), and how much light its core took away"""
     wiped: Any = None
     """where the eraser has been (shapely, board coordinates)"""
+    left: Any = None
+    """what the last pass's strokes could not wipe (shapely)"""
     stains: list[Any] = field(default_factory=list)
     """marks that do not come off (shapely)"""
 
@@ -428,6 +432,8 @@ class Mediator(Activity):
         memory.first = memory.first or choice
         if not choice.wipe:
             self._finish("clean", _marks(len(memory.stains)))
+        elif memory.left is not None and not memory.broken and self._near(choice.wipe, memory.left):
+            self._finish("dirty", NEAR)
         elif memory.number >= o.passes and not memory.broken:
             left = _area(choice.wipe) / _area(memory.first.wipe)
             passes = f"{memory.number} {'pass' if memory.number == 1 else 'passes'}"
@@ -440,6 +446,11 @@ class Mediator(Activity):
             self._go("hold")
         else:
             self._go("think")
+
+    @staticmethod
+    def _near(ink: Iterable[Array], left: Any) -> bool:
+        """All of the ink is where no stroke gets to."""
+        return all(left.buffer(SAME_PLACE).contains(shape(p, "ink")) for p in ink)
 
     def _chosen(self, look: Look) -> Choice:
         """What of the ink that is seen is to be wiped."""
@@ -549,8 +560,7 @@ class Mediator(Activity):
                 self._go("hold")
             return
         if route.work is None:
-            text = "what is left is too near to something that is to be left alone"
-            self._finish("dirty", text)
+            self._finish("dirty", NEAR)
             return
         if route.plan is not None and route.plan.left:
             count = len(route.plan.left)
@@ -566,6 +576,7 @@ class Mediator(Activity):
                 for a, b in itertools.pairwise(s)
             ]
             memory.wiped = shapely.union_all(ways)
+            memory.left = shapely.union_all([shape(p, "left") for p in route.plan.left])
         self._route_now = route
         self._go("move")
         self._paths.extend((0, p) for p in route.paths)
