@@ -157,7 +157,8 @@ def _patches(below: Image, inside: Image, weak: Image, things: Image, size: int,
     whole = np.zeros_like(weak)
     grown = cv2.resize(cv2.dilate(out, near), (3 * width, 3 * height), interpolation=cv2.INTER_NEAREST)
     whole[: grown.shape[0], : grown.shape[1]] = grown[: whole.shape[0], : whole.shape[1]]
-    return cv2.bitwise_and(whole, whole, mask=inside)
+    deep = cv2.compare(below, 0.5 * core, cv2.CMP_GT)  # the cells of nine pixels reach beyond it
+    return cv2.bitwise_and(whole, deep, mask=inside)
 
 
 def _shape(corners: Array) -> float:
