@@ -195,6 +195,70 @@ def test_a_magnet_is_not_ink():
     assert not any(np.linalg.norm(p.mean(0) - [0.75, 0.45]) < 0.05 for p in sight.ink_polygons)
 
 
+def laid(drawn):
+    """The board of `picture`, clean, with pixels of its texture darkened by what is drawn (BGR, part of the light)."""
+    flat = texture(strokes=False).astype(np.float32)
+    ink = np.zeros(flat.shape, np.float32)
+    drawn(ink)
+    H = cv2.getPerspectiveTransform(
+        np.float32([[30, 30], [930, 30], [930, 630], [30, 630]]) - np.float32(0.5), np.float32(VIEW)
+    )
+    scene = picture(strokes=False).astype(np.float32)
+    taken = cv2.warpPerspective(ink, H, (1280, 720), flags=cv2.INTER_LINEAR)
+    return scene * (1.0 - taken)
+
+
+@pytest.mark.parametrize("light", [(0.2, 0.2, 0.2), (0.18, 0.2, 0.0)])
+def test_a_pale_rest_wider_than_a_stroke_is_ink_and_a_shadow_is_not(light):
+    smudge = laid(lambda ink: cv2.ellipse(ink, (480, 330), (90, 40), 20, 0, 360, light, -1))
+    sight = vision.see(np.rint(smudge).astype(np.uint8), size=SIZE)
+    assert not sight.object_polygons
+    assert max(np.ptp(p[:, 0]) for p in sight.ink_polygons) > 0.12
+    soft = laid(
+        lambda ink: cv2.GaussianBlur(
+            cv2.ellipse(ink, (480, 330), (90, 40), 20, 0, 360, (0.2, 0.2, 0.2), -1), (0, 0), 30.0, ink
+        )
+    )
+    assert vision.see(np.rint(soft).astype(np.uint8)).dirty is False
+
+
+def test_the_mean_of_pictures_shows_what_each_of_them_hides():
+    rng = np.random.default_rng(0)
+    truth = laid(lambda ink: cv2.line(ink, (300, 300), (340, 300), (0.04, 0.04, 0.04), 6))
+
+    def taken():
+        light = truth * np.exp(0.1 * rng.standard_normal()) * np.exp(0.02 * rng.standard_normal(3))
+        return np.clip(np.rint(light + 2.0 * rng.standard_normal(light.shape)), 0, 255).astype(np.uint8)
+
+    frames = [taken() for _ in range(6)]
+    mean, moved = vision.average(frames)
+    assert not moved.any() and mean.dtype == np.uint8
+    sure = {"faint": 0.012, "clear": 0.02}
+    (piece,) = vision.ink(mean, VIEW, **sure).polygons
+    middle = cv2.perspectiveTransform(
+        np.float32([[[320, 300]]]),
+        cv2.getPerspectiveTransform(
+            np.float32([[30, 30], [930, 30], [930, 630], [30, 630]]) - np.float32(0.5), np.float32(VIEW)
+        ),
+    )[0, 0]
+    np.testing.assert_allclose(0.5 * (piece.min(0) + piece.max(0)), middle, atol=3.0)
+    assert vision.see(mean).dirty is False  # a lesser eye, as for a photograph
+    # who walks through is told, and given as last seen
+    frames[2][100:400, 200:300] = 40
+    mean, moved = vision.average(frames)
+    assert moved[100:400, 200:300].mean() > 0.9 and moved.mean() < 0.1
+    assert np.abs(mean[moved].astype(float) - 40.0).min() > 20.0
+
+
+def test_averages_and_thresholds_that_make_no_sense_are_refused(plain):
+    with pytest.raises(InputError, match="at least one picture"):
+        vision.average([])
+    with pytest.raises(InputError, match="of one size"):
+        vision.average([plain, plain[:-1]])
+    with pytest.raises(InputError, match="0 < faint <= clear < 1"):
+        vision.ink(plain, VIEW, faint=0.2, clear=0.1)
+
+
 def test_ink_alone_needs_corners(plain):
     with pytest.raises(InputError, match="corners must be"):
         vision.ink(plain, np.zeros((3, 2)))

@@ -171,6 +171,7 @@ def test_a_short_job_from_pixels_to_a_clean_board_with_a_pause_in_it():
     assert result.verdict == "clean" and not result.resumable and result.reason == ""
     assert result.ink_left == 0.0 and result.ink_after == scene.ink.area == 0.0
     assert result.before.sight.dirty and not result.after.sight.ink_polygons
+    assert told(result, "pass 1: 1 stroke, about")
     # the bounds hold, felt by nothing but the joints
     track = result.track
     assert track.force.max() <= 5.0 and track.moment.max() <= 2.0
@@ -264,6 +265,7 @@ def test_a_lost_eraser_is_named_and_the_job_goes_on_when_it_is_back():
     scene.find_eraser()
     again = work.run()
     assert again.verdict == "clean" and again.ink_left == 0.0
+    assert again.before is result.before and again.after.time_ns > result.after.time_ns
     assert len(again.track.time) > len(result.track.time)  # nothing of the log is lost
     scene.close()
 
@@ -311,7 +313,8 @@ def test_a_board_that_slides_is_noticed_and_held():
 @pytest.mark.slow
 def test_a_stop_is_safe_and_what_is_left_is_wiped_later():
     scene = made()
-    work, _, result = run(scene, (0.3, lambda s, w: w.stop()))
+    impatient = [(0.3 + 0.1 * k, lambda s, w: w.stop()) for k in range(20)]
+    work, _, result = run(scene, *impatient)
     assert result.verdict == "stopped" and result.resumable and "person" in result.reason
     assert scene.contact_force @ scene.contact_force == 0.0  # lifted
     assert np.abs(scene.state[0][1]).max() < 0.02
@@ -327,6 +330,53 @@ def test_a_board_out_of_reach_is_told():
     made().close()  # skips where there is no OpenGL
     result = run(scene)[2]
     assert result.verdict == "stopped" and not result.resumable and "out of reach" in result.reason
+    scene.close()
+
+
+@pytest.mark.slow
+def test_a_board_out_of_reach_is_brought_nearer_by_the_arm_that_holds_it():
+    made().close()  # skips where there is no OpenGL
+    ink = wipe.InkLayer((0.50, 0.36))
+    ink.stroke([[0.05, 0.03], [0.09, 0.04]], width=0.006)
+    ink.stroke([[0.42, 0.04], [0.45, 0.04]], width=0.006)
+    setting = wipe.Setting(centre=(0.68, 0.05, 0.15))
+    scene = wipe.BoardScene(ink, setting)
+    before = scene.T_world_board
+    result = run(scene, hold="always")[2]
+    assert result.verdict == "clean" and result.ink_left == 0.0 and result.track.contact.max() <= 6.0
+    (text,) = told(result, "brings the board")
+    assert "out of reach" in text and "nearer to the eraser's arm" in text
+    moved = scene.T_world_board[:3, 3] - before[:3, 3]
+    assert -0.14 < moved[0] < -0.02 and abs(moved[2]) < 2e-3 and scene.stands(scene.T_world_board)
+    scene.close()
+    # where nobody may take the board it says why not
+    ink.stroke([[0.05, 0.03], [0.09, 0.04]], width=0.006)
+    ink.stroke([[0.42, 0.04], [0.45, 0.04]], width=0.006)
+    scene = wipe.BoardScene(ink, setting)
+    result = run(scene)[2]
+    assert (
+        result.verdict == "stopped" and "out of reach" in result.reason and "no arm may take" in result.reason
+    )
+    scene.close()
+
+
+@pytest.mark.slow
+def test_dry_ink_takes_more_passes():
+    scene = made()
+    scene.ink.toughness[:] = 5.0 * wipe.ink.FRESH
+    result = run(scene)[2]
+    assert result.verdict == "clean" and result.ink_left == 0.0 and len(result.passes) == 3
+    scene.close()
+
+
+@pytest.mark.slow
+def test_a_faint_mark_that_does_not_come_off_is_told_from_ink():
+    scene = made()
+    scene.ink.stroke([[0.30, 0.08], [0.34, 0.08]], width=0.006, amount=0.045, toughness=1e9)
+    scene.ink.stroke([[0.30, 0.10], [0.34, 0.10]], width=0.006)
+    result = run(scene)[2]
+    assert result.verdict == "clean" and result.ink_left == 0.0
+    assert "a faint mark that does not come off" in result.reason and len(result.passes) <= 2
     scene.close()
 
 

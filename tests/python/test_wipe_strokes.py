@@ -256,6 +256,31 @@ def test_a_near_board_is_reached(arm):
     assert reach.manipulability > 0.01
 
 
+def test_no_leg_asks_for_more_than_the_bounds_give_the_arm(arm):
+    T = table(0.35, -0.2, 0.2)
+    bounds = {"max_force": 5.0, "max_torque": 2.0, "normal_force": 2.5}
+    free = {"slide": np.sqrt(5.0**2 - 2.5**2) - 0.5 * 2.5}  # what the bound and friction leave
+    for asked in (5.0, 0.01):
+        plan = wipe.plan([square(0.05, 0.05)], (0.4, 0.25), motion=wipe.Motion(acceleration=asked))
+        reach = wipe.reachable(arm, plan, T)
+        legs = wipe.paced(arm, plan, reach, T, **bounds)
+        assert [(a.phase, *a.start, *a.end) for a in legs] == [(a.phase, *a.start, *a.end) for a in plan.legs]
+        for leg in legs:
+            assert 0.0 < leg.acceleration <= asked
+            way = T[:3, :3] @ ((leg.end - leg.start) * [1.0, 1.0, -1.0] / leg.length)
+            for end in (leg.start, leg.end):
+                q = reach.q[np.linalg.norm(reach.points - end, axis=1).argmin()]
+                J = arm.jacobian(q, arm.grasp)
+                inertia = np.linalg.inv(J @ np.linalg.solve(arm.mass_matrix(q), J.T))
+                needed = inertia[:, :3] @ way * leg.acceleration
+                assert np.linalg.norm(needed[:3]) < free.get(leg.phase, 5.0)
+                assert np.linalg.norm(needed[3:]) < 2.0
+    assert {leg.acceleration for leg in legs} == {0.01}
+    far = wipe.reachable(arm, plan, table(2.0, -0.2, 0.2))
+    with pytest.raises(InputError, match="does not get everywhere"):
+        wipe.paced(arm, plan, far, table(2.0, -0.2, 0.2), **bounds)
+
+
 def test_a_far_board_is_not_and_it_says_why(arm):
     plan = wipe.plan([square(0.05, 0.05)], (0.4, 0.25))
     far = wipe.reachable(arm, plan, table(2.0, 0.0, 0.2))

@@ -89,6 +89,7 @@ def page(title: str, sections: Iterable[str]) -> str:
             # nothing may be fetched or run, whatever text got into the page
             '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
             "style-src 'unsafe-inline'; img-src data:\">",
+            '<meta name="generator" content="palpate">',  # by which its own pages are known, to be replaced
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<title>{escape(title)}</title>",
             f"<style>{_CSS}</style></head><body>",

@@ -21,6 +21,7 @@ from ._ink import Ink
 from .board import Board, detect
 from .camera import Camera, Plane, aspect, calibrate_charuco, calibrate_poses, charuco, plane
 from .compare import Change, compare
+from .frames import average
 from .published import Region
 from .published import detect as detect_published
 from .sight import DIRTY, METHODS, Method, Sight, annotated, ink, see
@@ -38,6 +39,7 @@ __all__ = [
     "Sight",
     "annotated",
     "aspect",
+    "average",
     "calibrate_charuco",
     "calibrate_poses",
     "charuco",

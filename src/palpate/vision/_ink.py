@@ -8,6 +8,7 @@ the surface's usual level around it, which ink falls below and a gap does not.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -35,8 +36,14 @@ DARK = 0.5
 PALE = 0.25
 """a wide piece inside the board that takes away less of the light than this, and is darker than what lies around, is a
 smudge, not a thing"""
+EVEN = 0.11
+"""standard deviation within a thing of what it takes away, relative to it: letters on a smudge make one filled piece"""
+PATCH = 12
+"""a pale piece wider than a stroke covers so many of every ninth pixels at least"""
 SPECK = 9
 """smallest connected piece [pixels]"""
+GRAIN = 0.05
+"""a piece whose core takes away less of the light is larger in proportion: dust and grain are single pixels"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +60,11 @@ class Ink:
     """(len(polygons),) part of the light that the piece takes away, at its core"""
 
 
-def find(image: Image, corners: Array) -> Ink:
-    """Ink in a picture (H, W, 3) within the quadrangle corners (4, 2) [pixels]."""
+def find(image: Image, corners: Array, *, faint: float = FAINT, clear: float = CLEAR) -> Ink:
+    """Ink in a picture (H, W, 3) within the quadrangle corners (4, 2) [pixels].
+
+    `faint` and `clear`: part of the light that the weakest and the core of a stroke take away, at least.
+    """
     height, width = image.shape[:2]
     low = np.clip(np.floor(corners.min(0)).astype(int) - 2, 0, None)
     high = np.minimum(np.ceil(corners.max(0)).astype(int) + 3, [width, height])
@@ -75,13 +85,20 @@ def find(image: Image, corners: Array) -> Ink:
         return Ink(np.zeros((height, width), bool), (), (), np.zeros(0))
     # the noise: half of a clean surface takes away less than the median, without strokes
     middle = float(np.median(surface))
-    noise = 1.4826 * float(np.median(np.abs(surface[surface <= 2.0 * middle + 2.0] - middle)))
-    faint = max(255.0 * FAINT, middle + SIGMAS * noise)
-    clear = max(255.0 * CLEAR, middle + 1.6 * SIGMAS * noise)
-    weak = ((taken > faint) & (below > 255.0 * BELOW) & (inside > 0)).astype(np.uint8)
+    away = np.abs(surface[surface <= 2.0 * middle + 2.0] - middle)
+    # the median distance of whole numbers is 0 or 1 where there is little noise; the mean one is finer
+    noise = max(1.4826 * float(np.median(away)), math.sqrt(0.5 * math.pi) * float(np.mean(away)))
+    weakest = max(255.0 * faint, middle + SIGMAS * noise)
+    core = max(255.0 * clear, middle + 1.6 * SIGMAS * noise)
+    darker = 255.0 * BELOW * min(1.0, faint / FAINT)
+    weak = ((taken > weakest) & (below > darker) & (inside > 0)).astype(np.uint8)
     things = _things(below, inside, weak, size)
+    patches = _patches(below, inside, weak, things, size, core)
+    if patches is not None:
+        weak |= patches
+        taken = cv2.max(taken, cv2.bitwise_and(below, below, mask=patches))
     ink = _pieces(
-        board, weak, taken, below, things, clear, corners - low, low, (height, width), shorter, edge / 2.0
+        board, weak, taken, below, things, core, corners - low, low, (height, width), shorter, edge / 2.0
     )
     found, _ = cv2.findContours(things, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     solid = tuple(3.0 * f.reshape(-1, 2) + 1.0 + low for f in found)
@@ -102,6 +119,46 @@ def _things(below: Image, inside: Image, weak: Image, size: int) -> Image:
         narrow = np.bincount(names, weak[1::3, 1::3].ravel(), count) / np.bincount(names, minlength=count)
         solid[narrow[label] > 0.8] = 0
     return solid
+
+
+def _patches(below: Image, inside: Image, weak: Image, things: Image, size: int, core: float) -> Image | None:
+    """Pale pieces wider than a stroke, which a closing fills: rests that were wiped about.
+
+    Shadows are as pale and as wide. They fade at their rims or run out of the board, so a patch is what ends within the
+    board in a step all around.
+    """
+    small = cv2.boxFilter(below, -1, (3, 3))[1::3, 1::3]
+    dark = ((small > core) & (inside[1::3, 1::3] > 0)).astype(np.uint8)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size // 6 + 1, size // 6 + 1))
+    solid = cv2.morphologyEx(dark, cv2.MORPH_OPEN, disc)
+    count, label, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
+    out = np.zeros_like(solid)
+    near = np.ones((3, 3), np.uint8)
+    height, width = solid.shape
+    for i in range(1, count):
+        x, y, w, h, area = stats[i]
+        window = np.s_[max(0, y - 4) : min(height, y + h + 4), max(0, x - 4) : min(width, x + w + 4)]
+        piece = (label[window] == i).astype(np.uint8)
+        if area < PATCH or np.any(piece & things[window]):
+            continue
+        if np.count_nonzero(piece & weak[1::3, 1::3][window]) > 0.8 * area:
+            continue  # it is found as it is
+        within = cv2.morphologyEx(piece, cv2.MORPH_GRADIENT, near) & piece
+        beyond = cv2.dilate(piece, np.ones((7, 7), np.uint8)) - cv2.dilate(piece, np.ones((5, 5), np.uint8))
+        beyond &= weak[1::3, 1::3][window] ^ 1
+        if np.any(inside[1::3, 1::3][window][beyond > 0] == 0) or not np.any(beyond):
+            continue
+        values = small[window]
+        usual = float(np.median(values[within > 0]))
+        if float(np.percentile(values[beyond > 0], 80)) < 0.5 * usual:
+            out[window] |= piece
+    if not out.any():
+        return None
+    whole = np.zeros_like(weak)
+    grown = cv2.resize(cv2.dilate(out, near), (3 * width, 3 * height), interpolation=cv2.INTER_NEAREST)
+    whole[: grown.shape[0], : grown.shape[1]] = grown[: whole.shape[0], : whole.shape[1]]
+    deep = cv2.compare(below, 0.5 * core, cv2.CMP_GT)  # the cells of nine pixels reach beyond it
+    return cv2.bitwise_and(whole, deep, mask=inside)
 
 
 def _shape(corners: Array) -> float:
@@ -142,10 +199,13 @@ def _darker(board: Image, weak: Image, piece: Mask, box: Array, strength: float)
     x, y, w, h = (int(v) for v in box)
     reach = 2 * max(w, h)
     window = np.s_[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
-    light = board[window].max(2)
-    around = light[(weak[window] == 0) & (light > 0)]
-    usual = float(np.percentile(around, 10)) if around.size else 0.0
-    return float(np.median(light[piece[window]])) < (1.0 - 0.5 * strength) * usual
+    light = board[window]
+    around = light[(weak[window] == 0) & (light.max(2) > 0)]
+    if not len(around):
+        return False
+    # a coloured pen takes its light from some channels only
+    usual = np.percentile(around, 10, axis=0)
+    return bool(np.any(np.median(light[piece[window]], axis=0) < (1.0 - 0.5 * strength) * usual))
 
 
 def _pieces(
@@ -191,9 +251,14 @@ def _pieces(
     last = np.array(around.shape[::-1]) - 1
     at = np.minimum(points // 3, last)
     beside = np.add.reduceat(around[at[:, 1], at[:, 0]].astype(np.float32), begin) > 0.3 * area
-    good = (hits >= np.maximum(3.0, 0.1 * area)) & (area >= SPECK) & ~rim & ~beside
+    good = (
+        (hits >= np.maximum(3.0, 0.1 * area))
+        & (area >= SPECK * np.maximum(1.0, GRAIN / np.maximum(strength, 1e-3)))
+        & ~rim
+        & ~beside
+    )
     wide = THING * shorter + 1.5
-    outlines, filled = {}, np.zeros(len(good))
+    outlines, filled, uneven = {}, np.zeros(len(good)), np.zeros(len(good))
     for i in np.flatnonzero(good):
         x, y, w, h = stats[i + 1, :4]
         piece = (label[y : y + h, x : x + w] == i + 1).astype(np.uint8)
@@ -206,16 +271,25 @@ def _pieces(
             core = 0.6 * float(np.percentile(dark[piece > 0], 90))
             solid = cv2.findNonZero(piece * (dark > core).astype(np.uint8))
             filled[i] = len(solid) / max(cv2.contourArea(cv2.convexHull(solid)), 1.0)
+            inner = cv2.erode(
+                piece * (dark > core).astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0
+            )
+            if inner.any():
+                level, spread = cv2.meanStdDev(dark, mask=inner)
+                uneven[i] = float(spread[0, 0] / max(level[0, 0], 1.0))
     # half of the ink is in pieces at most so thick; a filled piece tells nothing of a pen's width
     drawn = np.flatnonzero(good & (filled < 0.6))
     drawn = drawn[np.argsort(radius[drawn], kind="stable")]
     mass = np.cumsum(area[drawn])
     pen = float(radius[drawn[np.searchsorted(mass, 0.5 * mass[-1])]]) if len(drawn) else 0.0
     # a magnet, a sticker, an eraser, a hand: as wide as no stroke, and filled or reaching in from outside
-    broad = radius > np.maximum(wide, 1.8 * pen)
     bold = filled > 0.9
+    # where letters run together a pen seems thick, but what is round and much wider than a stroke is no letter
+    compact = bold & (area < 2.2 * np.pi * radius**2) & (radius > 1.5 * wide)
+    broad = radius > np.maximum(wide, np.where(compact, 1.2, 1.8) * pen)
     for i in np.flatnonzero(good & broad & bold & (strength < PALE)):
         bold[i] = not _darker(board, weak, label == i + 1, stats[i + 1, :4], float(strength[i]))
+    bold &= (strength < PALE) | (uneven < EVEN) | (radius > 3.0 * wide)
     thing = broad & (bold | (nearest < margin + 3.0))
     polygons, objects, contrast = [], [], []
     for i, (piece, line) in outlines.items():

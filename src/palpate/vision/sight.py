@@ -180,22 +180,29 @@ def _plane(
     return plane(found.corners, extent, size=size, camera=camera)
 
 
-def ink(image: npt.ArrayLike, corners: npt.ArrayLike) -> Ink:
+def ink(
+    image: npt.ArrayLike, corners: npt.ArrayLike, *, faint: float = _ink.FAINT, clear: float = _ink.CLEAR
+) -> Ink:
     """Ink on a writing surface.
 
     Args:
         image: (H, W, 3) BGR, (H, W) grey or (H, W, 4), uint8.
         corners: (4, 2) of the surface [pixels], clockwise as seen.
+        faint: part of the light, 0 to 1, that the weakest of a piece of ink takes away at least; less finds fainter
+            rests, and marks of the surface too.
+        clear: part that its core takes away at least.
 
     Raises:
-        InputError: not a picture; corners of another shape.
+        InputError: not a picture; corners of another shape; not 0 < faint <= clear < 1.
     """
     picture = checked(image)
     q = np.asarray(corners, np.float64)
     if q.shape != (4, 2) or not np.all(np.isfinite(q)):
         raise InputError(f"corners must be (4, 2) and finite, got {q.shape}")
+    if not 0.0 < faint <= clear < 1.0:
+        raise InputError(f"ink: expected 0 < faint <= clear < 1, got {faint!r} and {clear!r}")
     fine, scale = shrunk(picture, board.FINE)
-    found = _ink.find(fine, rescaled(q, scale))
+    found = _ink.find(fine, rescaled(q, scale), faint=faint, clear=clear)
     if scale == 1.0:
         return found
     mask = cv2.resize(

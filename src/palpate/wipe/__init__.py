@@ -29,7 +29,7 @@ from .film import Film, Video
 from .ink import InkLayer, handwriting
 from .job import WipeJob
 from .options import JobOptions
-from .reach import Reach, inverse_kinematics, reachable, tool_poses
+from .reach import Reach, inverse_kinematics, paced, reachable, tool_poses
 from .record import RunRecorder
 from .result import Event, JobResult, Look, Observer, Pass, Tick, Timing, Track
 from .scene import BoardScene, Setting
@@ -65,6 +65,7 @@ __all__ = [
     "handwriting",
     "ink_colours",
     "inverse_kinematics",
+    "paced",
     "plan",
     "random_board",
     "reachable",

@@ -17,8 +17,8 @@ from ..errors import InputError, suggest
 from ..vision import Sight
 from .strokes import outlines, shape
 
-GREY = 60.0
-"""least chroma, of 255, of ink that is not black: the widest channel less the narrowest, light taken away"""
+GREY = 0.25
+"""least chroma of ink that is not black: by what its channels take away light differently, relative to the most"""
 HUES: Mapping[str, float] = {"red": 0.0, "yellow": 60.0, "green": 120.0, "blue": 225.0, "purple": 285.0}
 """hue of the usual markers [deg]"""
 COLOURS = ("black", *HUES)
@@ -123,7 +123,7 @@ def ink_colours(image: npt.ArrayLike, sight: Sight) -> tuple[str, ...]:
 
 def _name(bgr: Array) -> str:
     b, g, r = bgr
-    if bgr.max() - bgr.min() < GREY:
+    if bgr.max() - bgr.min() < GREY * (255.0 - bgr.min()):  # of thin ink as of thick
         return "black"
     hue = math.degrees(math.atan2(math.sqrt(3.0) * (g - b), 2.0 * r - g - b)) % 360.0
     return min(HUES, key=lambda n: abs((hue - HUES[n] + 180.0) % 360.0 - 180.0))

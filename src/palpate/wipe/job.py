@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -13,7 +12,7 @@ from ..arm import Array
 from ..errors import InputError
 from .activity import Activity, Slot, timing
 from .fast import Control, Estimation, Robot, Torques, Wipe
-from .mediator import Mediator, Others
+from .mediator import Mediator, Memory, Others
 from .options import JobOptions
 from .result import Event, JobResult, Kind, Look, Observer, Pass, Tick, Timing, Track
 from .scene import BoardScene, _table
@@ -56,7 +55,8 @@ class WipeJob:
         self._rows: list[tuple[float, ...]] = []
         self._phases: list[str] = []
         self._looks: list[Look] = []
-        self._number = 0
+        self._memory = Memory()
+        self._told = 0
         self._cycles: dict[str, list[float]] = {name: [] for name in (*PERIODS_NS, "simulation")}
         self._ink = scene.ink.area
         self._wish: Slot[str] = Slot()
@@ -153,7 +153,6 @@ class WipeJob:
             for activity in activities:
                 activity.finish()
                 self._cycles[activity.name] += activity.cycles
-        self._number = mediator.number
         self._done = not mediator.resumable
         return self._result(mediator, time.perf_counter() - begin, activities)
 
@@ -164,9 +163,7 @@ class WipeJob:
         estimation = Estimation(scene.arms, p["estimation"], robot)
         home = tuple(np.zeros(a.n) for a in scene.arms)
         perception = Perception(scene, p["perception"], threaded)
-        navigation = Navigation(
-            scene, p["navigation"], threaded, o.motions, replace(scene.eraser, rub=o.rub), (home[0], home[1])
-        )
+        navigation = Navigation(scene, p["navigation"], threaded, o, (home[0], home[1]))
         control = Control(
             scene.arms, p["control"], estimation.felt, command, lambda text: mediator.faulted(text)
         )
@@ -184,10 +181,9 @@ class WipeJob:
             scene.camera,
             scene.ink.size,
         )
-        mediator = Mediator(
-            p["mediator"], o, others, self._tell, self._pass, self._number, self._open is not None
-        )
-        self._mediator = mediator
+        self._memory.broken = self._open is not None
+        mediator = Mediator(p["mediator"], o, others, self._tell, self._pass, self._memory)
+        self._mediator, self._told = mediator, 0
         for activity in (perception, navigation, mediator, estimation, control, robot):
             activity.told = lambda name, state: self._tell("activity", f"{name} is {state}")
         return others, mediator
@@ -227,7 +223,8 @@ class WipeJob:
 
     def _record(self, others: Others, mediator: Mediator, activities: tuple[Activity, ...]) -> None:
         scene, report = self.scene, others.control.report.newest
-        for look in mediator.looks[len(self._looks) :]:
+        for look in mediator.looks[self._told :]:
+            self._told += 1
             self._looks.append(look)
             if self._observer is not None:
                 self._observer.look(look)

@@ -5,16 +5,17 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
+import shapely
 from statemachine import State, StateMachine
 
 from .. import vision
-from .._core import AbagParameters, CartesianVelocityOptions
+from .._core import AbagParameters, CartesianVelocityOptions, Posture
 from ..arm import Arm, Array
 from ..control import CartesianVelocity
 from .activity import Activity, Slot
@@ -23,8 +24,8 @@ from .fast import Control, Estimation, Follow, Hold, Law, Robot, Wipe
 from .motion import Path
 from .options import JobOptions
 from .result import Kind, Look, Verdict
-from .slow import Navigation, Perception, Route, Situation, ToGrip, ToPark, ToStrokes
-from .strokes import Plan
+from .slow import Navigation, Perception, Route, Situation, ToBring, ToGrip, ToPark, ToStrokes
+from .strokes import Plan, outlines, shape, swept
 
 SURE = 0.8
 """confidence of a board from which its place is believed"""
@@ -44,6 +45,14 @@ SHAPE = 2.0
 """corners of a board found are so far at most from those of the nearest pose of a board of the right size [pixel]"""
 PATIENCE_NS = 2_000_000_000
 """for a torque channel to come back [ns]"""
+LEFT = 0.005
+"""part of the ink's area that may be left on a clean board"""
+SAME_PLACE = 0.004
+"""rests lie so near the ink they are left of [m]"""
+STAIN, STAYS = 0.06, 0.8
+"""a mark that takes away less than this part of the light, and so much of it after the eraser was there, is no ink"""
+NEAR = "what is left is too near to something that is to be left alone, or to a corner of the board"
+"""why it ends dirty before the passes are used up"""
 CALM_NS = 400_000_000
 """at rest after a fault before anything moves; a channel must be well for so long [ns]"""
 
@@ -71,6 +80,8 @@ GAINS: Mapping[str, Any] = {
     ),
     "turning": 8.0,
     "approach": 5.0,
+    # the elbow drifts; a joint at its limit of speed would be braked, and the tool with it
+    "posture": Posture(damping=4.0, largest=3.0),
 }
 
 Cause: TypeAlias = Literal["", "torque", "contact", "hand", "other"]
@@ -83,14 +94,16 @@ class Mission(StateMachine):
     looking = State()
     holding = State()
     planning = State()
+    bringing = State()
     moving = State()
     wiping = State()
     safe = State()
     releasing = State()
     ended = State(final=True)
 
-    look = parking.to(looking) | holding.to(looking)
-    hold = looking.to(holding)
+    look = parking.to(looking) | holding.to(looking) | bringing.to(looking)
+    hold = looking.to(holding) | planning.to(holding)
+    bring = planning.to(bringing)
     think = looking.to(planning) | holding.to(planning)
     move = planning.to(moving)
     wipe = moving.to(wiping) | safe.to(wiping)
@@ -100,18 +113,40 @@ class Mission(StateMachine):
         | looking.to(safe)
         | holding.to(safe)
         | planning.to(safe)
+        | bringing.to(safe)
         | moving.to(safe)
         | wiping.to(safe)
     )
-    release = looking.to(releasing) | planning.to(releasing)
+    release = looking.to(releasing) | planning.to(releasing) | bringing.to(releasing)
     end = (
         looking.to(ended)
         | planning.to(ended)
         | holding.to(ended)
+        | bringing.to(ended)
         | safe.to(ended)
         | releasing.to(ended)
         | parking.to(ended)
     )
+
+
+@dataclass(slots=True, eq=False)
+class Memory:
+    """What a job knows of its board, however often it is stopped and goes on."""
+
+    number: int = 0
+    """passes that were begun"""
+    broken: bool = False
+    """the last one was broken off in its middle"""
+    first: Choice | None = None
+    """what was to be wiped, and what was to stay, before the first pass"""
+    marks: list[tuple[Any, float]] = field(default_factory=list)
+    """ink as it was seen before the last pass (shapely, board coordinates), and how much light its core took away"""
+    wiped: Any = None
+    """where the eraser has been (shapely, board coordinates)"""
+    left: Any = None
+    """what the last pass's strokes could not wipe (shapely)"""
+    stains: list[Any] = field(default_factory=list)
+    """marks that do not come off (shapely)"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,6 +210,17 @@ def displacement(reference: Look, now: Look) -> float | None:
     return None
 
 
+def _marks(count: int) -> str:
+    if not count:
+        return ""
+    marks = "a faint mark that does" if count == 1 else f"{count} faint marks that do"
+    return f"but for {marks} not come off, taken for the surface's own"
+
+
+def _area(polygons: Iterable[Array]) -> float:
+    return float(shapely.union_all([shape(p, "ink") for p in polygons]).area)
+
+
 class Mediator(Activity):
     """Sees to it that a board gets clean.
 
@@ -184,8 +230,7 @@ class Mediator(Activity):
         others: the activities it tells what to do.
         tell: called with what happened.
         passed: called when a pass has begun, is halted, goes on or is done.
-        number: passes that were made before.
-        broken: the last one was broken off.
+        memory: of what was done before; it is kept up to date.
     """
 
     def __init__(
@@ -195,8 +240,7 @@ class Mediator(Activity):
         others: Others,
         tell: Callable[[Kind, str], None],
         passed: Callable[[str, Plan | None, float], None],
-        number: int,
-        broken: bool,
+        memory: Memory,
     ) -> None:
         super().__init__("mediator", period_ns)
         self.mission = Mission()
@@ -204,7 +248,7 @@ class Mediator(Activity):
         self.verdict: Verdict = "stopped"
         self.reason = ""
         self.resumable = False
-        self.number = number
+        self.memory = memory
         self.T_base_board: Array | None = None
         self.looks: list[Look] = []
         self.wipe: Wipe | None = None
@@ -215,13 +259,19 @@ class Mediator(Activity):
         self._asked = False
         self._paths: deque[tuple[int, Path]] = deque()
         self._law: tuple[int, Law] | None = None
-        self._tries = self._grips = self._again = self._doubts = 0
+        self._tries = self._grips = self._again = self._doubts = self._brought = 0
+        self._unreachable = self._refused = ""
+        self._stopping = False
         self._choice: Choice | None = None
         self._reference: Look
         self._hand: Array | None = None
-        self._broken = broken  # off in the middle of a pass
         self._loose = True  # as far as is known the board stays where it is by itself
         self._checked = 0
+
+    @property
+    def number(self) -> int:
+        """Passes that were begun."""
+        return self.memory.number
 
     # -- from outside ----------------------------------------------------------
 
@@ -231,6 +281,9 @@ class Mediator(Activity):
 
     def stop(self, why: str) -> None:
         """Come to a safe end."""
+        if self._stopping:
+            return
+        self._stopping = True
         if self.task not in ("safe", "ended", "releasing"):
             self._halt("other", why)
         elif self.task == "safe":
@@ -266,14 +319,14 @@ class Mediator(Activity):
         self._cause, self.reason = cause, text
         self._tell("person" if cause == "other" else "fault", text)
         if self.task == "wiping":
-            self._broken = True
+            self.memory.broken, self.memory.wiped = True, None
             self._passed("halted", None, 0.0)
         self._go("fail")
 
     def _finish(self, verdict: Verdict, reason: str, *, resumable: bool = False) -> None:
         self.verdict, self.reason, self.resumable = verdict, reason, resumable
         held = self._others.robot.held
-        if held and verdict != "stopped" and self.task in ("looking", "planning"):
+        if held and verdict != "stopped" and self.task in ("looking", "planning", "bringing"):
             self._others.robot.grip.put(False)
             self._go("release")
         else:
@@ -285,7 +338,7 @@ class Mediator(Activity):
         T = self.T_base_board
         return Situation(felt.q, self._others.nominal if T is None else T)
 
-    def _route(self, question: ToStrokes | ToGrip | ToPark) -> Route | None:
+    def _route(self, question: ToStrokes | ToGrip | ToBring | ToPark) -> Route | None:
         """Ask once; the answer when it is there."""
         if not self._asked:
             self._asked = True
@@ -334,7 +387,7 @@ class Mediator(Activity):
     _now = 0
 
     def _looking(self) -> None:
-        look = self._look("after" if self.looks else "before")
+        look = self._look("before" if self.memory.first is None else "after")
         if look is None:
             return
         self.looks.append(look)
@@ -374,24 +427,68 @@ class Mediator(Activity):
         self._plan_or_end(look)
 
     def _plan_or_end(self, look: Look) -> None:
-        o = self._options
-        self._choice = choose(
-            look.sight.ink_polygons,
-            colours=ink_colours(look.image, look.sight) if o.colour is not None else None,
-            colour=o.colour,
-            within=o.within,
-            without=o.without,
-            objects=look.sight.object_polygons,
-        )
-        if not self._choice.wipe:
-            self._finish("clean", "")
-        elif self.number >= o.passes and not self._broken:
-            left = f"{1e2 * look.sight.covered:.2g} % of the board"
-            self._finish("dirty", f"after {self.number} passes ink is still seen on {left}")
+        o, memory = self._options, self.memory
+        choice = self._choice = self._chosen(look)
+        memory.first = memory.first or choice
+        if not choice.wipe:
+            self._finish("clean", _marks(len(memory.stains)))
+        elif memory.left is not None and not memory.broken and self._near(choice.wipe, memory.left):
+            self._finish("dirty", NEAR)
+        elif memory.number >= o.passes and not memory.broken:
+            left = _area(choice.wipe) / _area(memory.first.wipe)
+            passes = f"{memory.number} {'pass' if memory.number == 1 else 'passes'}"
+            if left <= LEFT:
+                self._tell("board", f"after {passes} no more than {1e2 * LEFT:g} % of the ink's area is seen")
+                self._finish("clean", "")
+            else:
+                self._finish("dirty", f"after {passes} {1e2 * left:.2g} % of the ink's area is still seen")
         elif not self._others.robot.held and (o.hold == "always" or (o.hold == "needed" and not self._loose)):
             self._go("hold")
         else:
             self._go("think")
+
+    @staticmethod
+    def _near(ink: Iterable[Array], left: Any) -> bool:
+        """All of the ink is where no stroke gets to."""
+        return all(left.buffer(SAME_PLACE).contains(shape(p, "ink")) for p in ink)
+
+    def _chosen(self, look: Look) -> Choice:
+        """What of the ink that is seen is to be wiped."""
+        o, memory, sight = self._options, self.memory, look.sight
+        assert sight.ink is not None
+        pieces = [
+            (shape(p, "ink"), float(c)) for p, c in zip(sight.ink_polygons, sight.ink.contrast, strict=True)
+        ]
+        if memory.wiped is not None:
+            memory.stains += [
+                p
+                for p, c in pieces
+                if c < STAIN
+                and memory.wiped.contains(p)
+                and any(c > STAYS * before and p.intersects(q) for q, before in memory.marks)
+            ]
+        memory.wiped = None
+        memory.marks = pieces
+        stained = shapely.union_all(memory.stains).buffer(SAME_PLACE) if memory.stains else None
+        ink = [p for p in sight.ink_polygons if stained is None or not stained.contains(shape(p, "ink"))]
+        if o.colour is None or memory.first is None:
+            return choose(
+                ink,
+                colours=ink_colours(look.image, look.sight) if o.colour is not None else None,
+                colour=o.colour,
+                within=o.within,
+                without=o.without,
+                objects=look.sight.object_polygons,
+            )
+        # the colour of a rest cannot be told; its place tells what it is left of
+        goes = shapely.union_all([shape(p, "ink") for p in memory.first.wipe]).buffer(SAME_PLACE)
+        stays = shapely.union_all([shape(p, "ink") for p in memory.first.keep])
+        rests = choose(
+            [r for p in ink for r in outlines(shape(p, "ink").intersection(goes).difference(stays))],
+            within=o.within,
+            without=o.without,
+        )
+        return Choice(rests.wipe, (*memory.first.keep, *look.sight.object_polygons))
 
     def _look(self, why: str) -> Look | None:
         if not self._asked:
@@ -404,11 +501,13 @@ class Mediator(Activity):
 
     def _holding(self) -> None:
         if self._law is None and not self._paths and self._hand is None:
-            route = self._route(ToGrip(self._situation()))
+            assert self._choice is not None
+            route = self._route(ToGrip(self._situation(), self._choice.wipe, self._choice.keep))
             if route is None:
                 return
             if route.reason:
                 if self._loose:
+                    self._refused = route.reason
                     self._tell("board", f"{route.reason}; the board stays loose")
                     self._go("think")
                 else:
@@ -449,21 +548,64 @@ class Mediator(Activity):
         if route is None:
             return
         if route.reason:
-            self._finish("stopped", route.reason)
+            self._unreachable = route.reason
+            if route.plan is None or not route.plan.strokes or self._brought >= LOOKS:
+                self._finish("stopped", route.reason)
+            elif self._others.robot.held:
+                self._brought += 1
+                self._go("bring")
+            elif self._options.hold == "never" or self._refused:
+                self._finish("stopped", f"{route.reason}; {self._refused or 'no arm may take the board'}")
+            else:
+                self._go("hold")
             return
         if route.work is None:
-            text = "what is left is too near to something that is to be left alone"
-            self._finish("dirty", text)
+            self._finish("dirty", NEAR)
             return
         if route.plan is not None and route.plan.left:
-            self._tell("task", f"{len(route.plan.left)} places are out of the eraser's reach")
-        self.number += not self._broken  # a pass that was broken off goes on
-        self._broken = False
+            count = len(route.plan.left)
+            places = "a place is" if count == 1 else f"{count} places are"
+            self._tell("task", f"{places} out of the eraser's reach")
+        memory = self.memory
+        memory.number += not memory.broken  # a pass that was broken off goes on
+        memory.broken = False
+        if route.plan is not None:
+            ways = [
+                swept(a, b, route.plan.footprint)
+                for s in route.plan.strokes
+                for a, b in itertools.pairwise(s)
+            ]
+            memory.wiped = shapely.union_all(ways)
+            memory.left = shapely.union_all([shape(p, "left") for p in route.plan.left])
         self._route_now = route
         self._go("move")
         self._paths.extend((0, p) for p in route.paths)
 
     _route_now = Route()
+
+    def _bringing(self) -> None:
+        """The other arm takes the board to where the eraser reaches; then it is looked at again."""
+        if not self._parked:
+            assert self._choice is not None
+            route = self._route(ToBring(self._situation(), self._choice.wipe, self._choice.keep))
+            if route is None:
+                return
+            if route.reason:
+                self._finish("stopped", f"{self._unreachable}; {route.reason}")
+                return
+            self._paths.extend((1, p) for p in route.paths)
+            self._parked = True
+            where = "nearer to the eraser's arm" if route.away < 0.0 else "away from the eraser's arm"
+            self._tell(
+                "board",
+                f"{self._unreachable}; the other arm brings the board {1e2 * abs(route.away):.0f} cm {where}",
+            )
+        if not self._went():
+            return
+        self._others.control.orders[1].put(Hold(self._others.arms[1], 1))
+        self._hand, self.T_base_board = self._holder_hand(), None
+        self._go("look")
+        self._tries = 0
 
     def _moving(self) -> None:
         if not self._went():
@@ -481,7 +623,8 @@ class Mediator(Activity):
         seen = self.looks[-1].sight.covered
         self._passed("begun", route.plan, seen)
         strokes = len(route.plan.strokes) if route.plan is not None else 0
-        self._tell("task", f"pass {self.number}: {strokes} strokes, about {self.wipe.total:.0f} s")
+        many = "1 stroke" if strokes == 1 else f"{strokes} strokes"
+        self._tell("task", f"pass {self.number}: {many}, about {self.wipe.total:.0f} s")
 
     def _begin_wiping(self) -> None:
         assert self.wipe is not None
@@ -535,7 +678,7 @@ class Mediator(Activity):
                 self.wipe.resume()
                 self._well = 0
                 self._cause = ""
-                self._broken = False
+                self.memory.broken = False
                 self._go("wipe")
                 self._passed("resumed", None, 0.0)
                 self._begin_wiping()

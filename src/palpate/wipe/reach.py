@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arm import Arm, Array
 from ..errors import InputError
-from .strokes import Plan
+from .strokes import Leg, Plan
 
 STEP = 0.03
 """way between two looks [m]"""
@@ -23,6 +23,10 @@ DAMPING = 0.02
 """of the least squares, while far from the goal"""
 JUMP = 0.6
 """no joint turns further between two looks [rad]"""
+FRICTION = 0.5
+"""of felt on a board, at most"""
+RESERVE = 0.3
+"""part of the bounds that is left for the controller when a leg asks for its largest acceleration"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,6 +112,53 @@ def reachable(
     return best
 
 
+def paced(
+    arm: Arm,
+    plan: Plan,
+    reach: Reach,
+    T_base_board: npt.ArrayLike,
+    *,
+    max_force: float,
+    max_torque: float,
+    normal_force: float,
+) -> tuple[Leg, ...]:
+    """The legs of a plan with no more acceleration than bounded forces can give the arm where it then is.
+
+    What an arm sets against the tool's acceleration in a direction e is Lambda e, Lambda = (J M^-1 J^T)^-1 (Khatib
+    1987): force and moment. A reference that asks for more runs away from the tool, which then overshoots.
+
+    Args:
+        arm: the arm.
+        plan: of :func:`plan`.
+        reach: of :func:`reachable` for it, ok.
+        T_base_board: (4, 4) [m].
+        max_force: bound of the force [N].
+        max_torque: bound of the moment [N m].
+        normal_force: by which the eraser is pressed on [N].
+
+    Raises:
+        InputError: the arm does not reach.
+    """
+    if not reach.ok:
+        raise InputError(f"paced: the arm does not get everywhere: {reach.reason}")
+    R = np.asarray(T_base_board, dtype=np.float64)[:3, :3]
+    sliding = math.sqrt(max(max_force**2 - normal_force**2, 0.0)) - FRICTION * normal_force
+    legs, first = [], 0
+    for leg in plan.legs:
+        count = _count(leg)
+        poses, first = reach.q[first : first + count], first + count
+        J = arm.jacobian(poses, arm.grasp)
+        inertia = np.linalg.inv(J @ np.linalg.solve(arm.mass_matrix(poses), J.swapaxes(1, 2)))
+        way = R @ ((leg.end - leg.start) * [1.0, 1.0, -1.0] / max(leg.length, 1e-9))
+        force = np.linalg.norm(inertia[:, :3, :3] @ way, axis=1).max()
+        moment = np.linalg.norm(inertia[:, 3:, :3] @ way, axis=1).max()
+        # a leg that friction alone would stop is tried all the same, slowly
+        free = max(sliding, 0.1 * max_force) if leg.phase == "slide" else max_force
+        most = (1.0 - RESERVE) * min(free / max(force, 1e-9), max_torque / max(moment, 1e-9))
+        legs.append(replace(leg, acceleration=min(leg.acceleration, float(most))))
+    return tuple(legs)
+
+
 def inverse_kinematics(
     arm: Arm, T_base_tool: npt.ArrayLike, *, q: npt.ArrayLike | None = None, margin: float = 0.05
 ) -> Array | None:
@@ -154,8 +205,13 @@ def _samples(plan: Plan) -> Array:
     """Points (N, 3) along all legs, at most STEP apart."""
     rows = [np.zeros((0, 3))]
     for leg in plan.legs:
-        rows.append(np.linspace(leg.start, leg.end, max(2, math.ceil(leg.length / STEP) + 1)))
+        rows.append(np.linspace(leg.start, leg.end, _count(leg)))
     return np.concatenate(rows)
+
+
+def _count(leg: Leg) -> int:
+    """Points along a leg."""
+    return max(2, math.ceil(leg.length / STEP) + 1)
 
 
 def _follow(

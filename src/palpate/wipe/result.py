@@ -163,7 +163,7 @@ class JobResult:
     verdict: Verdict
     """clean or dirty as the camera sees it; stopped: it did not get to its end"""
     reason: str
-    """one sentence: why it is not clean, or why it stopped; empty if clean"""
+    """one sentence: why it is not clean, why it stopped, or what marks do not come off; else empty"""
     resumable: bool
     """stopped, and :meth:`palpate.wipe.WipeJob.run` goes on where it was"""
     passes: tuple[Pass, ...]

@@ -44,6 +44,10 @@ STIFFNESS = 600.0
 """of the whole felt [N/m]"""
 TRAVEL = 0.012
 """of a pad [m]"""
+WHITE = 0.85
+"""part of the light that the clean surface gives back, so that the cell's lamps do not burn it out"""
+BRIGHT = 240.0
+"""the camera's exposure keeps all but a hundredth of the picture below this, of 255"""
 MAGNET = (0.014, 0.009)
 """radius and height of a magnet [m]"""
 GRIP = 0.012
@@ -327,6 +331,28 @@ class BoardScene:
                     least = min(least, mj.mj_geomDistance(model, d, int(a), int(b), least, None))
         return least
 
+    def stands(self, T_world_board: npt.ArrayLike) -> bool:
+        """A board in this pose (4, 4) would stand on the table with all its feet."""
+        R, centre = self._table
+        W, H = self.ink.size
+        T = np.asarray(T_world_board, dtype=np.float64)
+        feet = np.array(
+            [
+                [0.5 * W + a * x, 0.5 * H + b * y, 0.0]
+                for a in (-1, 1)
+                for b in (-1, 1)
+                for x, y in [self._feet]
+            ]
+        )
+        spots = (feet @ T[:3, :3].T + T[:3, 3] - centre) @ R
+        return bool(np.all(np.abs(spots[:, :2]) < np.array(_tabletop(W, H)) - FOOT))
+
+    @property
+    def _feet(self) -> tuple[float, float]:
+        """From the board's middle to its feet [m]."""
+        W, H = self.ink.size
+        return 0.85 * (0.5 * W + FRAME), 0.85 * (0.5 * H + FRAME)
+
     # -- what people and hands do ----------------------------------------------
 
     def close_grip(self) -> bool:
@@ -453,6 +479,8 @@ class BoardScene:
     def look(self) -> npt.NDArray[np.uint8]:
         """A picture (H, W, 3) BGR with blur, noise and a light that is never quite the same.
 
+        Like any camera's, its exposure keeps what is bright from burning out.
+
         Raises:
             PalpateError: no OpenGL on this machine.
         """
@@ -465,6 +493,7 @@ class BoardScene:
         rgb = self._shown(self._lens)
         gain = np.exp(s.lamps * rng.standard_normal()) * np.exp(0.2 * s.lamps * rng.standard_normal(3))
         light = rgb[..., ::-1].astype(np.float32) * gain.astype(np.float32)
+        light *= min(1.0, BRIGHT / max(float(np.percentile(light[::4, ::4].max(2), 99.0)), 1.0))
         if s.blur > 0.0:
             light = cv2.GaussianBlur(light, (0, 0), s.blur)
         if s.noise > 0.0:
@@ -539,7 +568,7 @@ class BoardScene:
         spec.worldbody.add_geom(
             name="table",
             type=box,
-            size=(0.55 * W + 0.1, 0.55 * H + 0.1, 0.02),
+            size=(*_tabletop(W, H), 0.02),
             pos=top + R @ [0.0, 0.0, 0.02],
             quat=_model.quaternion(R),
             rgba=(0.55, 0.42, 0.3, 1.0),
@@ -559,12 +588,12 @@ class BoardScene:
             contype=0,
             conaffinity=1 | 2,
         )
-        for a in (-0.85, 0.85):
-            for b in (-0.85, 0.85):
+        for a in (-1.0, 1.0):
+            for b in (-1.0, 1.0):
                 board.add_geom(
                     type=sphere,
                     size=(FOOT, 0.0, 0.0),
-                    pos=(a * outer[0], b * outer[1], THICK + FOOT),
+                    pos=(a * self._feet[0], b * self._feet[1], THICK + FOOT),
                     mass=0.0,
                     contype=4,
                     conaffinity=0,
@@ -587,7 +616,7 @@ class BoardScene:
             height=rows,
             builtin=mj.mjtBuiltin.mjBUILTIN_FLAT,  # the ink comes with each picture
         )
-        material = spec.add_material(name="ink", specular=0.2, shininess=0.6)
+        material = spec.add_material(name="ink", specular=0.2, shininess=0.6, rgba=(*(3 * (WHITE,)), 1.0))
         textures = list(material.textures)
         textures[mj.mjtTextureRole.mjTEXROLE_RGB] = "ink"
         material.textures = textures
@@ -773,6 +802,11 @@ def _table(s: Setting) -> tuple[Array, Array]:
     c, k = math.cos(s.tilt), math.sin(s.tilt)
     R = np.array([[c, 0.0, -k], [0.0, 1.0, 0.0], [k, 0.0, c]]) @ flat
     return R, np.array(s.centre, dtype=np.float64)
+
+
+def _tabletop(width: float, height: float) -> tuple[float, float]:
+    """Half its sides under a board of this size [m]."""
+    return 0.55 * width + 0.1, 0.55 * height + 0.1
 
 
 def _holder_base() -> Array:

@@ -7,9 +7,10 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -18,7 +19,8 @@ from ..arm import Array
 from .activity import Activity, Slot
 from .fast import Work
 from .motion import Path, find
-from .reach import inverse_kinematics, reachable, tool_poses
+from .options import JobOptions
+from .reach import inverse_kinematics, paced, reachable, tool_poses
 from .result import Look
 from .scene import FRAME, THICK, BoardScene
 from .strokes import Eraser, Motion, Plan, plan
@@ -34,8 +36,19 @@ BACK = 0.08
 """way of the gripper's fingers towards the rim [m]"""
 
 
+FRAMES = 5
+"""pictures of which the mean is looked at"""
+FAINT, CLEAR = 0.012, 0.02
+"""part of the light that the weakest and the core of what is left of ink take away, at least: a twentieth of a layer of
+ink takes 0.04, half of it where it is no wider than a pixel"""
 FREE = 0.003
 """a hand about to take the board keeps so far from everything [m]"""
+MARGINS = (0.4, 0.05)
+"""of the arm's joints from their limits: what is good, and what will do [rad]"""
+DRAG, FARTHEST = 0.03, 10
+"""the board is brought by so many steps of so much at most [m]"""
+STEEP = 0.33
+"""largest inclination of the fingers against the board with which the gripper takes it [rad]"""
 TURN = 0.6
 """no joint turns further on such a short way, or the hand would leave it [rad]"""
 
@@ -59,7 +72,7 @@ class Slow(Activity, Generic[Question, Answer]):
             self._coming = None
         if self.state != "running":
             return
-        question = self.question.take()
+        question = self.ready()
         if question is None:
             return
         think = self.thinking(time_ns, question)
@@ -67,6 +80,10 @@ class Slow(Activity, Generic[Question, Answer]):
             self.answer.put(think())
         else:
             self._coming = self._pool.submit(think)
+
+    def ready(self) -> Question | None:
+        """A question for which everything is there."""
+        return self.question.take()
 
     @abstractmethod
     def thinking(self, time_ns: int, question: Question) -> Callable[[], Answer]:
@@ -79,22 +96,54 @@ class Slow(Activity, Generic[Question, Answer]):
 
 
 class Perception(Slow[str, Look]):
-    """Takes a picture and looks for the board and the ink; the question is what the picture is for."""
+    """Takes pictures and looks for the board and the ink; the question is what they are for.
+
+    With the arms out of the way (before, after) it takes FRAMES of them, one in each cycle, and looks at their mean;
+    after wiping for whatever ink could be told from the surface. A check is one picture.
+    """
 
     def __init__(self, scene: BoardScene, period_ns: int, threaded: bool) -> None:
         super().__init__("perception", period_ns, threaded)
         self._scene = scene
         self._camera = scene.camera
+        self._why: str | None = None
+        self._frames: list[npt.NDArray[np.uint8]] = []
+
+    def ready(self) -> str | None:
+        """A picture in each cycle, until there are enough for what they are for."""
+        question = self.question.take()
+        if question is not None:
+            self._why, self._frames = question, []
+        if self._why is None:
+            return None
+        self._frames.append(self._scene.look())
+        if self._why != "check" and len(self._frames) < FRAMES:
+            return None
+        why, self._why = self._why, None
+        return why
 
     def thinking(self, time_ns: int, question: str) -> Callable[[], Look]:
-        """The picture now; what is in it later."""
-        image = self._scene.look()
+        """What is in the pictures, later."""
+        frames, size = self._frames, self._scene.ink.size
 
         def see() -> Look:
-            sight = vision.see(image, size=self._scene.ink.size, camera=self._camera)
+            image, moved = vision.average(frames)
+            sight = vision.see(image, size=size, camera=self._camera)
+            if sight.board is not None and moved[_within(sight.board.corners, moved.shape)].any():
+                image = frames[-1]  # somebody is in front of the board: noise, but no ghosts
+                sight = vision.see(image, size=size, camera=self._camera)
+            if question == "after" and sight.board is not None:
+                rests = vision.ink(image, sight.board.corners, faint=FAINT, clear=CLEAR)
+                sight = replace(sight, ink=rests)
             return Look(time_ns, image, sight, question)
 
         return see
+
+
+def _within(corners: Array, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+    mask = np.zeros(shape, np.uint8)
+    cv2.fillConvexPoly(mask, np.rint(corners).astype(np.int32), 1)
+    return mask > 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,9 +166,20 @@ class ToStrokes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToGrip:
-    """How does the other arm take the board?"""
+    """How does the other arm take the board, so that it can bring what is dirty into the eraser's reach if need be?"""
 
     now: Situation
+    wipe: tuple[npt.NDArray[np.float64], ...]
+    keep: tuple[npt.NDArray[np.float64], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToBring:
+    """How does the other arm, which holds the board, bring it to where all that is dirty is in the eraser's reach?"""
+
+    now: Situation
+    wipe: tuple[npt.NDArray[np.float64], ...]
+    keep: tuple[npt.NDArray[np.float64], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,9 +199,11 @@ class Route:
     reason: str = ""
     plan: Plan | None = None
     work: Work | None = None
+    away: float = 0.0
+    """by which the board is taken away from the eraser's base, < 0: towards it [m]"""
 
 
-class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
+class Navigation(Slow["ToStrokes | ToGrip | ToBring | ToPark", Route]):
     """Strokes, grasps and ways for both arms."""
 
     def __init__(
@@ -149,19 +211,22 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
         scene: BoardScene,
         period_ns: int,
         threaded: bool,
-        motion: Motion,
-        eraser: Eraser,
+        options: JobOptions,
         home: tuple[Array, Array],
     ) -> None:
         super().__init__("navigation", period_ns, threaded)
-        self._scene, self._motion, self._eraser, self._home = scene, motion, eraser, home
+        self._scene, self._options, self._home = scene, options, home
+        self._motion: Motion = options.motions
+        self._eraser: Eraser = replace(scene.eraser, rub=options.rub)
 
-    def thinking(self, time_ns: int, question: ToStrokes | ToGrip | ToPark) -> Callable[[], Route]:
+    def thinking(self, time_ns: int, question: ToStrokes | ToGrip | ToBring | ToPark) -> Callable[[], Route]:
         """All of it later."""
         if isinstance(question, ToStrokes):
             return lambda: self._strokes(question)
         if isinstance(question, ToGrip):
-            return lambda: self._grip(question.now)
+            return lambda: self._grip(question)
+        if isinstance(question, ToBring):
+            return lambda: self._bring(question)
         return lambda: self._park(question.now, question.arm)
 
     def _strokes(self, question: ToStrokes) -> Route:
@@ -199,13 +264,25 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
             return Route(plan=strokes)
         # the arm goes to the first stroke through the air, by its joints
         strokes = made(strokes.strokes[0][0], strokes.turned)
-        reach = reachable(arm, strokes, now.T_base_board)
+        for margin in MARGINS:
+            reach = reachable(arm, strokes, now.T_base_board, margin=margin)
+            if reach.ok:
+                break
         if not reach.ok:
             return Route(reason=f"the board is out of reach: {reach.reason}", plan=strokes)
         path = self._way(0, now, reach.q[0])
         if path is None:
             return Route(reason="there is no clear way for the arm to the board", plan=strokes)
-        legs = strokes.legs
+        o = self._options
+        legs = paced(
+            arm,
+            strokes,
+            reach,
+            now.T_base_board,
+            max_force=o.max_force,
+            max_torque=o.max_torque,
+            normal_force=o.normal_force,
+        )
         number = itertools.accumulate(leg.phase == "touch" for leg in legs)
         work = Work(
             legs,
@@ -217,14 +294,23 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
         )
         return Route((path,), plan=strokes, work=work)
 
-    def _grip(self, now: Situation) -> Route:
-        """By a rim that is not the eraser's side, fingers a little inclined so that the hand stays off the table."""
+    def _grip(self, question: ToGrip) -> Route:
+        """By a rim that is not the eraser's side, fingers a little inclined so that the hand stays off the table.
+
+        More, where the board is out of the eraser's reach: the hand that drags it goes over the table.
+        """
+        now = question.now
+        far = bool(self._strokes(ToStrokes(now, question.wipe, question.keep)).reason)
         arm, (W, H) = self._scene.arms[1], self._scene.ink.size
         T = self._scene.T_holder_base @ now.T_base_board
         out, clearance = np.array([0.0, 0.0, 1.0]), self._clearance(1, now)
         rims = [((a * W, -FRAME), (0.0, 1.0)) for a in (0.5, 0.3, 0.7)]
         rims += [((W + FRAME, 0.3 * H), (-1.0, 0.0)), ((-FRAME, 0.3 * H), (1.0, 0.0))]
-        for (at, inward), incline, side in itertools.product(rims, (0.15, 0.3, 0.0), (1.0, -1.0)):
+        inclines = (STEEP, 0.3, 0.15, 0.0) if far else (0.15, 0.3, 0.0)
+        ways = list(itertools.product(rims, inclines, (1.0, -1.0)))
+        if far:
+            ways.sort(key=lambda w: -w[1])
+        for (at, inward), incline, side in ways:
             c, s = math.cos(incline), math.sin(incline)
             d = np.array([*inward, 0.0])
             z, y = c * d + s * out, side * (c * out - s * d)
@@ -243,6 +329,45 @@ class Navigation(Slow["ToStrokes | ToGrip | ToPark", Route]):
             if path is not None:
                 return Route((path, Path((q, goal), 0.2)))
         return Route(reason="the other arm cannot take the board: no grasp of its rim is in reach")
+
+    def _bring(self, question: ToBring) -> Route:
+        """Along the table towards the eraser's arm or away from it, as little as will do."""
+        now = question.now
+        T = now.T_base_board
+        W, H = self._scene.ink.size
+        middle = T[:3, :3] @ [0.5 * W, 0.5 * H, 0.0] + T[:3, 3]
+        way = middle - T[:3, 2] * (T[:3, 2] @ middle)
+        way /= np.linalg.norm(way)
+        for k, sign in itertools.product(range(1, FARTHEST + 1), (-1.0, 1.0)):
+            away = sign * k * DRAG
+            there = T.copy()
+            there[:3, 3] += away * way
+            if not self._scene.stands(there):
+                continue
+            if self._strokes(ToStrokes(Situation(now.q, there), question.wipe, question.keep)).reason:
+                continue
+            path = self._drag(now, away * way)
+            if path is not None:
+                return Route((path,), away=away)
+        return Route(reason="there is no place on the table to which the other arm can bring it")
+
+    def _drag(self, now: Situation, way: Array) -> Path | None:
+        """Of the other arm with the board in its hand, straight."""
+        arm, aside = self._scene.arms[1], now.T_base_board.copy()
+        aside[:3, 3] += [0.0, 0.0, 10.0]  # the board goes with the hand: nothing to keep clear of
+        hand = arm.forward_kinematics(now.q[1])
+        hand[:3, 3] += hand[:3, :3] @ arm.grasp
+        count = math.ceil(float(np.linalg.norm(way)) / DRAG)
+        poses = [now.q[1]]
+        for _ in range(count):
+            hand[:3, 3] += self._scene.T_holder_base[:3, :3] @ way / count
+            q = inverse_kinematics(arm, hand, q=poses[-1])
+            if q is None or float(np.abs(q - poses[-1]).max()) > TURN:
+                return None
+            if self._scene.clearance(1, q, now.q[0], aside) < 0.0:
+                return None
+            poses.append(q)
+        return Path(tuple(poses), 0.2)
 
     def _park(self, now: Situation, which: int) -> Route:
         q, home = now.q[which], self._home[which]
