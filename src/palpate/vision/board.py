@@ -40,6 +40,8 @@ class Board:
     """(4,): the side from corner i to the next is the board's own edge; False: it is where the picture ends"""
     spread: Array
     """(4,) deviation of the edge from a straight line, per side [pixels]"""
+    sigma: Array
+    """(4,) standard deviation of the corners: root of the mean square distance to where they are [pixels]"""
 
     @property
     def complete(self) -> bool:
@@ -83,6 +85,7 @@ def detect(image: npt.ArrayLike, *, most: int = 3) -> tuple[Board, ...]:
                 confidence,
                 ~np.roll(quads.border[i], -turn),
                 np.roll(edges.spread, -turn) / fine_scale,
+                np.roll(edges.sigma, -turn) / fine_scale,
             )
         )
     return tuple(boards)
