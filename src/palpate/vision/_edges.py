@@ -4,8 +4,8 @@ A side is looked at in a strip along it: brightness as a function of the distanc
 Averaged over a whole side even an edge fainter than the noise of a pixel is clear. Every edge that runs along the whole
 side, straight and perhaps a little askew, may be the border: those of a frame, of its groove, of the shadow that it
 throws. Going from the surface outward the border is the first one that is none of a shadow, of writing or of
-compression: each is judged by logistic regression on how clear, how sharp and how consistent it is and what lies on both
-of its sides, and the chance that it is the border is that it is one and that none further inside was.
+compression: each is judged by logistic regression on how clear, how sharp and how consistent it is and what lies on
+both of its sides, and the chance that it is the border is that it is one and that none further inside was.
 """
 
 from __future__ import annotations
@@ -258,13 +258,9 @@ def _candidates(strips: _Strips, k: int) -> _Candidates:
         if len(at) < 3:
             continue
         bends = 0.5 * np.abs(total[s, at + KINK] - 2.0 * total[s, at] + total[s, at - KINK])
-        for i in range(1, len(at) - 1):
-            if (
-                bends[i] < bends[i - 1]
-                or bends[i] <= bends[i + 1]
-                or bends[i] <= max(0.06 * size, 4.0 * noise)
-            ):
-                continue
+        middle = bends[1:-1]
+        clear = (middle >= bends[:-2]) & (middle > bends[2:]) & (middle > max(0.06 * size, 4.0 * noise))
+        for i in np.flatnonzero(clear) + 1:
             place = float(at[i]) - BLUR / PITCH
             if min(abs(place - x) for x in row) * PITCH < 1.5:
                 continue

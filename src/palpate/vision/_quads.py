@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ..arm import Array
@@ -20,7 +21,7 @@ CORNER = 12.0
 """how far around a corner its sides are looked at [pixels]"""
 OUT_OF_VIEW = 0.5
 """support that the picture's border is taken to give a side"""
-SHORTLIST = 128
+SHORTLIST = 64
 """quadrangles looked at more closely"""
 GRID = 12
 """points per direction at which the inside is looked at"""
@@ -126,16 +127,15 @@ class _Support:
         self.half = int(np.hypot(width, height) / 2.0) + 20
         self.border = border
         t = np.arange(-self.half, self.half + 1)
-        hit = np.zeros((len(offset), len(t)), bool)
         at = self.origin[:, None] + self.along[:, None] * t[None, :, None]
-        for shift in (-1.0, 0.0, 1.0):
-            xy = np.rint(at + shift * normal[:, None]).astype(np.int64)
-            inside = (xy[..., 0] >= 0) & (xy[..., 0] < width) & (xy[..., 1] >= 0) & (xy[..., 1] < height)
-            index = np.clip(xy[..., 1], 0, height - 1) * width + np.clip(xy[..., 0], 0, width - 1)
-            gx, gy = gradient.x.ravel()[index], gradient.y.ravel()[index]
-            across = np.abs(gx * normal[:, :1] + gy * normal[:, 1:])
-            aside = np.abs(gx * normal[:, 1:] - gy * normal[:, :1])
-            hit |= inside & (across > gradient.noise) & (aside < 0.6 * across)
+        beside = np.stack([at - normal[:, None], at, at + normal[:, None]]).astype(np.float32)
+        both = cv2.merge([gradient.x, gradient.y])
+        maps = beside.reshape(-1, len(t), 2)
+        edge = cv2.remap(both, maps, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        gx, gy = np.moveaxis(edge.reshape(*beside.shape), 3, 0)
+        nx, ny = normal.astype(np.float32).T[:, :, None]
+        across, aside = np.abs(gx * nx + gy * ny), np.abs(gx * ny - gy * nx)
+        hit = ((across > gradient.noise) & (aside < 0.6 * across)).any(0)
         support = hit.astype(np.float64)
         support[border] = OUT_OF_VIEW
         self.total = np.concatenate([np.zeros((len(offset), 1)), np.cumsum(support, 1)], 1)

@@ -22,7 +22,7 @@ ROUGH = 512
 """longer side of the copy in which boards are looked for [pixels]"""
 FINE = 1280
 """longer side of the copy in which edges are fitted [pixels]"""
-LINES = 34
+LINES = 30
 """straight lines looked at"""
 SURE = 0.3
 """least confidence of a board that is reported"""
