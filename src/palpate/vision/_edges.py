@@ -42,8 +42,10 @@ SHOULDER = 9
 """rows inward of an edge in which it may end"""
 BLUR = 1.3
 """from the middle of an edge to its bend [pixels]"""
-LOSS = 3.0
-"""an error beyond this is as bad as this one [pixels]"""
+WRONG, WORST = 2.0, 4.0
+"""a side is wrong if it is off by more than the first; below, and up to the second, less is better [pixels]"""
+NEAR = 0.02
+"""loss by a square pixel, relative to being wrong"""
 BOW = 0.4
 """a side is straight if its middle is nearer to its chord [pixels]"""
 
@@ -74,32 +76,32 @@ FEATURES = (
 )
 WEIGHTS = np.array(
     [
-        0.813,
-        -1.074,
-        0.162,
-        1.232,
-        -0.383,
-        6.067,
-        0.985,
-        -1.071,
-        -0.305,
-        -0.077,
-        -1.022,
-        0.086,
-        -0.149,
-        0.279,
-        -0.312,
-        -0.594,
-        -2.485,
-        -0.507,
-        1.820,
-        -0.641,
-        0.080,
-        0.065,
-        1.432,
+        0.842,
+        -0.473,
+        0.066,
+        0.715,
+        1.436,
+        3.616,
+        0.823,
+        -0.975,
+        -0.347,
+        -0.144,
+        -0.948,
+        0.174,
+        0.145,
+        0.194,
+        -0.473,
+        -0.534,
+        -2.441,
+        -0.624,
+        2.088,
+        -0.160,
+        -0.045,
+        0.087,
+        0.771,
     ]
 )
-BIAS = -1.160
+BIAS = -1.662
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,15 +133,15 @@ class _Side:
         return _normal(self.p, self.q)
 
 
-def fit(image: Image, corners: Array, border: Mask) -> Edges:
+def fit(grey: Image, corners: Array, border: Mask) -> Edges:
     """Find the border of the surface along every side.
 
     Args:
-        image: (H, W, 3).
+        grey: (H, W).
         corners: (4, 2) rough, clockwise.
         border: (4,) bool: this side is the picture's border and stays.
     """
-    strips = _strips(image, corners)
+    strips = _strips(grey, corners)
     sides = [
         _Side(corners[k], corners[(k + 1) % 4], 0.0, 0.0, 0.0) if border[k] else _side(strips, k)
         for k in range(4)
@@ -172,7 +174,7 @@ class _Strips:
     """(4, SHEARS, R) part of the stretches that agree with it"""
 
 
-def _strips(image: Image, corners: Array) -> _Strips:
+def _strips(grey: Image, corners: Array) -> _Strips:
     around = np.array([np.roll(corners, -k, 0) for k in range(4)])
     H = homographies(around)
     ends = np.diff(mapped(H, np.array([[0.5, 0.0], [0.5, 0.01]])), axis=1)[:, 0]
@@ -184,7 +186,7 @@ def _strips(image: Image, corners: Array) -> _Strips:
     for k in range(4):
         v = (first[k] + PITCH * np.array([-1.0, count])) / extent[k]
         size = (STRETCHES * EACH, count + 2)
-        strip = _strip(image, H[k], (ENDS, 1.0 - ENDS), (float(v[0]), float(v[1])), size)
+        strip = _strip(grey, H[k], (ENDS, 1.0 - ENDS), (float(v[0]), float(v[1])), size)
         # means of medians of three far from each other: a stroke or a magnet covers few of them
         apart = np.moveaxis(strip.reshape(count + 2, STRETCHES, 3, EACH // 3), 2, 0)
         profile[k] = _between(*apart).mean(2, dtype=np.float32)
@@ -215,16 +217,13 @@ def _between(a: Float, b: Float, c: Float) -> Float:
 
 
 def _strip(
-    image: Image, H: Array, u: tuple[float, float], v: tuple[float, float], size: tuple[int, int]
+    grey: Image, H: Array, u: tuple[float, float], v: tuple[float, float], size: tuple[int, int]
 ) -> Image:
-    """Brightness along a side: columns from u[0] to u[1] and rows from v[0] to v[1] on the unit square of H."""
+    """What lies along a side: columns from u[0] to u[1] and rows from v[0] to v[1] on the unit square of H."""
     du, dv = (u[1] - u[0]) / (size[0] - 1), (v[1] - v[0]) / (size[1] - 1)
     place = np.array([[du, 0.0, u[0]], [0.0, dv, v[0]], [0.0, 0.0, 1.0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.cvtColor(
-        cv2.warpPerspective(image, H @ place, size, flags=flags, borderMode=cv2.BORDER_REPLICATE),
-        cv2.COLOR_BGR2GRAY,
-    )
+    return cv2.warpPerspective(grey, H @ place, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,7 +370,7 @@ def _side(strips: _Strips, k: int) -> _Side:
     chance = _chances(found.features)
     place = strips.first[k] + PITCH * found.row
     best, left = _least_loss(place, chance)
-    i = int(np.argmax(chance * (np.abs(place - best) <= LOSS)))
+    i = int(np.argmax(chance * (np.abs(place - best) <= WORST)))
     curve, spread, points = _refined(strips, k, float(found.row[i]), int(found.shear[i]))
     curve[0] += best - place[i]
     ends = np.array([[0.0, curve[0]], [1.0, curve.sum()]]) / [1.0, strips.extent[k]]
@@ -382,14 +381,12 @@ def _side(strips: _Strips, k: int) -> _Side:
 def _least_loss(place: Array, chance: Array) -> tuple[float, float]:
     """Where to put the border if it lies at one of the places [pixels], and the mean square error left there.
 
-    Of least expected square error, an error beyond LOSS counted as LOSS: between edges near to each other that are
-    equally likely it lies in the middle.
+    Where it is least likely to be wrong: of two edges near to each other it may have to be between them.
     """
-    at = np.linspace(place.min(), place.max(), max(2, round(float(np.ptp(place)) / 0.25)))
-    at = np.append(at, place[chance.argmax()])
-    square = (at[:, None] - place) ** 2
-    i = int((np.minimum(square, LOSS**2) @ chance).argmin())
-    return float(at[i]), float(square[i] @ chance) / max(float(chance.sum()), 1e-6)
+    at = np.append(np.linspace(place.min(), place.max(), max(2, round(float(np.ptp(place)) / 0.25))), place)
+    off = np.abs(at[:, None] - place)
+    i = int((((off > WRONG) + NEAR * np.minimum(off, WORST) ** 2) @ chance).argmin())
+    return float(at[i]), float(off[i] ** 2 @ chance) / max(float(chance.sum()), 1e-6)
 
 
 def _refined(strips: _Strips, k: int, row: float, shear: int) -> tuple[Array, float, int]:

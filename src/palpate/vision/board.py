@@ -64,6 +64,7 @@ def detect(image: npt.ArrayLike, *, most: int = 3) -> tuple[Board, ...]:
     rough, scale = shrunk(fine, ROUGH)
     grey = cv2.cvtColor(rough, cv2.COLOR_BGR2GRAY)
     quads = _quads.find(_lines.find(grey, LINES), _lines.gradient(grey), rough, grey)
+    sharp = cv2.cvtColor(fine, cv2.COLOR_BGR2GRAY)
     boards: list[Board] = []
     taken = np.zeros(grey.shape, bool)
     for i in range(len(quads.score)):
@@ -76,7 +77,7 @@ def detect(image: npt.ArrayLike, *, most: int = 3) -> tuple[Board, ...]:
         inside = _filled(quads.corners[i], grey.shape)
         if taken[inside].mean() > 0.1:
             continue
-        edges = _edges.fit(fine, rescaled(quads.corners[i], 1.0 / scale), quads.border[i])
+        edges = _edges.fit(sharp, rescaled(quads.corners[i], 1.0 / scale), quads.border[i])
         taken |= inside
         turn = int(np.argmin(edges.corners.sum(1)))
         boards.append(
