@@ -46,6 +46,8 @@ WRONG, WORST = 2.0, 4.0
 """a side is wrong if it is off by more than the first; below, and up to the second, less is better [pixels]"""
 NEAR = 0.02
 """loss by a square pixel, relative to being wrong"""
+LEFT = 0.25
+"""what blur, compression and the lens leave of the place of the sharpest corner, standard deviation [pixels]"""
 BOW = 0.4
 """a side is straight if its middle is nearer to its chord [pixels]"""
 
@@ -73,35 +75,14 @@ FEATURES = (
     "steady",  # log of the step over its deviation among stretches
     "next",  # log of the strongest close outside over its own
     "below",  # 1: the strongest along the side lies further inside
+    "beyond",  # log of the difference between the surface and what lies further outside of it, past a line or a groove
+    "even",  # the same over that of the edge
+    "repeated",  # steps further outside, of the other edges, half as strong, at most 3
 )
 WEIGHTS = np.array(
-    [
-        0.842,
-        -0.473,
-        0.066,
-        0.715,
-        1.436,
-        3.616,
-        0.823,
-        -0.975,
-        -0.347,
-        -0.144,
-        -0.948,
-        0.174,
-        0.145,
-        0.194,
-        -0.473,
-        -0.534,
-        -2.441,
-        -0.624,
-        2.088,
-        -0.160,
-        -0.045,
-        0.087,
-        0.771,
-    ]
+    [-0.161, 0.940, -0.095, 0.630, -0.150, 8.947, 0.707, -0.579, -0.488, -0.247, -0.750, 0.084, 0.459, 0.147, 0.456, -0.171, -2.580, -0.686, 1.625, 0.303, -0.393, -0.055, 0.991, 0.013, 0.384, -0.677]
 )
-BIAS = -1.662
+BIAS = -0.151
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,6 +278,7 @@ def _features(
     surface = average(at + 8, at + 32)
     inner = np.abs(average(at + 4, at + 10) - surface)
     outer = np.abs(average(at - 5, at - 1) - surface)
+    beyond = np.abs(average(at - 20, at - 10) - average(at + 4, at + 10))
     deeper = np.maximum.accumulate(best[::-1])[::-1]
     inside = np.where(at + 4 < count, deeper[np.minimum(at + 4, count - 1)], 0.0)
     x = np.empty((found, len(FEATURES)))
@@ -343,6 +325,9 @@ def _features(
         np.log(np.minimum(size / (deviation + 0.3), 30.0)),
         np.log((close + 0.3) / strength),
         (row[strongest] > row + 2.0).astype(np.float64) if found else np.zeros(0),
+        np.log(beyond + 0.5),
+        np.log((beyond + 0.3) / size),
+        np.minimum(((distance > 8.0) & (strength[None] > 0.5 * strength[:, None])).sum(1), 3.0),
     )
     for i, column in enumerate(columns):
         x[:, i] = column
@@ -437,7 +422,7 @@ def _corner(before: _Side, after: _Side) -> Array:
 def _corner_sigma(before: _Side, after: _Side) -> float:
     """Root of the mean square distance of a corner whose sides may be moved [pixels]."""
     sine = float(before.inward[0] * after.inward[1] - before.inward[1] * after.inward[0])
-    return float(np.hypot(before.sigma, after.sigma) / max(abs(sine), 0.1))
+    return float(np.hypot(np.hypot(before.sigma, after.sigma) / max(abs(sine), 0.1), LEFT))
 
 
 def _at(curve: Array, t: Array) -> Array:

@@ -69,8 +69,11 @@ def find(lines: Lines, gradient: Gradient, image: Image, grey: Image) -> Quads:
     i, j = np.triu_indices(n, 1)
     # side[a, p]: support of line a between its crossings with the two lines of pair p
     side, ends, valid = support.sides(i, j, SHORTEST * max(width, height))
+    crossed = valid.sum(0) >= 2  # two lines have a side between these two
+    i, j, side, ends, valid = i[crossed], j[crossed], side[:, crossed], ends[:, crossed], valid[:, crossed]
     first = valid[i] & valid[j]  # (pair, pair)
-    p, q = np.nonzero(np.triu(first & first.T, 1))
+    p, q = np.nonzero(first & first.T)
+    p, q = p[p < q], q[p < q]
     keep = border[i[p]].astype(int) + border[j[p]] + border[i[q]] + border[j[q]] <= 1
     p, q = p[keep], q[keep]
     if not len(p):
@@ -126,9 +129,10 @@ class _Support:
         self.origin = centre + (offset - normal @ centre)[:, None] * normal
         self.half = int(np.hypot(width, height) / 2.0) + 20
         self.border = border
-        t = np.arange(-self.half, self.half + 1)
-        at = self.origin[:, None] + self.along[:, None] * t[None, :, None]
-        beside = np.stack([at - normal[:, None], at, at + normal[:, None]]).astype(np.float32)
+        t = np.arange(-self.half, self.half + 1, dtype=np.float32)
+        origin, along, across = (x.astype(np.float32)[:, None] for x in (self.origin, self.along, normal))
+        at = origin + along * t[:, None]
+        beside = np.stack([at - across, at, at + across])
         both = cv2.merge([gradient.x, gradient.y])
         maps = beside.reshape(-1, len(t), 2)
         edge = cv2.remap(both, maps, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)

@@ -22,7 +22,7 @@ ROUGH = 512
 """longer side of the copy in which boards are looked for [pixels]"""
 FINE = 1280
 """longer side of the copy in which edges are fitted [pixels]"""
-LINES = 30
+LINES = 40
 """straight lines looked at"""
 SURE = 0.3
 """least confidence of a board that is reported"""
@@ -41,7 +41,8 @@ class Board:
     spread: Array
     """(4,) deviation of the edge from a straight line, per side [pixels]"""
     sigma: Array
-    """(4,) standard deviation of the corners: root of the mean square distance to where they are [pixels]"""
+    """(4,) standard deviation of the corners: root of the mean square distance to where they are [pixels]; if it is a
+    board, which is what ``confidence`` is about; NaN: not known"""
 
     @property
     def complete(self) -> bool:

@@ -97,6 +97,7 @@ class Sight:
             "boards": [
                 {
                     "corners_px": rounded(b.corners, 2),
+                    "corners_sigma_px": None if np.isnan(b.sigma).any() else rounded(b.sigma, 2),
                     "confidence": round(b.confidence, 4),
                     "complete": b.complete,
                     "side_in_view": b.in_view.tolist(),
