@@ -29,9 +29,11 @@ OUTWARD, INWARD = 0.05, 0.14
 """from so far outside of the rough side to so far inside, relative to the board"""
 LEAST_OUTWARD, LEAST_INWARD = 9.0, 18.0
 """at least so far [pixels]"""
-SHEARS = np.arange(-10.0, 10.1, 2.5)
+SHEARS = np.concatenate([[-30.0, -22.5, -15.0], np.arange(-10.0, 10.1, 2.5), [15.0, 22.5, 30.0]])
 """from one end of a side to the other an edge may lean by this against the rough side [pixels]"""
 STRAIGHT = len(SHEARS) // 2
+ASKEW = 10.0
+"""where one leans by more the strips are laid anew along what was found [pixels]"""
 AGREE = 0.35
 """a stretch agrees with an edge if it steps by this part of the mean"""
 APART = 3
@@ -69,7 +71,7 @@ FEATURES = (
     "brighter",  # the surface is, 1, or darker, -1
     "depth",  # distance from the rough side, in twentieths of the board
     "deep",  # the same where above 0.03 of the board
-    "askew",  # pixels from end to end against the rough side, in thirds
+    "askew",  # pixels from end to end against the rough side, at most ASKEW, in thirds
     "shoulder",  # 1: no edge by itself, but where one ends
     "bend",  # log of its bend over the edge's step
     "steady",  # log of the step over its deviation among stretches
@@ -80,7 +82,34 @@ FEATURES = (
     "repeated",  # steps further outside, of the other edges, half as strong, at most 3
 )
 WEIGHTS = np.array(
-    [-0.161, 0.940, -0.095, 0.630, -0.150, 8.947, 0.707, -0.579, -0.488, -0.247, -0.750, 0.084, 0.459, 0.147, 0.456, -0.171, -2.580, -0.686, 1.625, 0.303, -0.393, -0.055, 0.991, 0.013, 0.384, -0.677]
+    [
+        -0.161,
+        0.940,
+        -0.095,
+        0.630,
+        -0.150,
+        8.947,
+        0.707,
+        -0.579,
+        -0.488,
+        -0.247,
+        -0.750,
+        0.084,
+        0.459,
+        0.147,
+        0.456,
+        -0.171,
+        -2.580,
+        -0.686,
+        1.625,
+        0.303,
+        -0.393,
+        -0.055,
+        0.991,
+        0.013,
+        0.384,
+        -0.677,
+    ]
 )
 BIAS = -0.151
 
@@ -122,14 +151,23 @@ def fit(grey: Image, corners: Array, border: Mask) -> Edges:
         corners: (4, 2) rough, clockwise.
         border: (4,) bool: this side is the picture's border and stays.
     """
+    sides, met = _around(grey, corners, border)
+    moved = met - corners
+    lean = [(moved[k - 3] - moved[k]) @ _normal(corners[k], corners[k - 3]) for k in range(4)]
+    if max(map(abs, lean)) > ASKEW:
+        sides, met = _around(grey, met, border)
+    sigma = np.array([_corner_sigma(sides[k - 1], sides[k]) for k in range(4)])
+    return Edges(met, np.array([s.spread for s in sides]), sigma)
+
+
+def _around(grey: Image, corners: Array, border: Mask) -> tuple[list[_Side], Array]:
+    """The sides found near the rough ones, and the corners (4, 2) where they meet."""
     strips = _strips(grey, corners)
     sides = [
         _Side(corners[k], corners[(k + 1) % 4], 0.0, 0.0, 0.0) if border[k] else _side(strips, k)
         for k in range(4)
     ]
-    met = np.array([_corner(sides[k - 1], sides[k]) for k in range(4)])
-    sigma = np.array([_corner_sigma(sides[k - 1], sides[k]) for k in range(4)])
-    return Edges(met, np.array([s.spread for s in sides]), sigma)
+    return sides, np.array([_corner(sides[k - 1], sides[k]) for k in range(4)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,7 +357,7 @@ def _features(
         np.sign(mean[shear, at]),
         depth / 0.05,
         np.maximum(depth - 0.03, 0.0) / 0.05,
-        np.abs(SHEARS[shear]) / 3.0,
+        np.minimum(np.abs(SHEARS[shear]), ASKEW) / 3.0,
         shoulder.astype(np.float64),
         np.log(np.where(shoulder, bend / parent, 1.0)),
         np.log(np.minimum(size / (deviation + 0.3), 30.0)),
