@@ -272,17 +272,17 @@ def _candidates(strips: _Strips, k: int) -> _Candidates:
     total = np.cumsum(mean, 1)
     for r, s, size in zip(peaks, lean[peaks], list(parent), strict=True):
         # an edge so near to another that blur joins them is no peak of steepness; where it ends the picture still bends
-        at = np.arange(r + KINK, min(r + SHOULDER, count - KINK))
+        at = np.arange(int(r) + KINK, min(int(r) + SHOULDER, count - KINK))
         if len(at) < 3:
             continue
         bends = 0.5 * np.abs(total[s, at + KINK] - 2.0 * total[s, at] + total[s, at - KINK])
         middle = bends[1:-1]
         clear = (middle >= bends[:-2]) & (middle > bends[2:]) & (middle > max(0.06 * size, 4.0 * noise))
         for i in np.flatnonzero(clear) + 1:
-            place = float(at[i]) - BLUR / PITCH
-            if min(abs(place - x) for x in row) * PITCH < 1.5:
+            ends = float(at[i]) - BLUR / PITCH
+            if min(abs(ends - x) for x in row) * PITCH < 1.5:
                 continue
-            row.append(place)
+            row.append(ends)
             shear.append(int(s))
             bend.append(float(bends[i]))
             parent.append(size)
