@@ -2,8 +2,8 @@
 
 A board is four straight edges, each supported by the picture along most of its length, that meet at corners and do not
 run on, around a surface that is even and light and has other brightness than what lies beyond. Candidates come from
-the straight lines of a small copy of the picture; they are judged by that evidence, and the best ones are fitted to the
-inner edges of the frame at full resolution.
+the straight lines of a small copy of the picture; they are judged by that evidence, and the borders of the best ones'
+surfaces are looked for at full resolution.
 """
 
 from __future__ import annotations
