@@ -2,11 +2,11 @@
 
     PYTHONPATH=src python scripts/fit_border_weights.py [VIEWS [DRAWN]]
 
-Along every side of VIEWS rendered views, and of DRAWN others whose boards may bear a printed grid, a box along the border
-or rows of text, all candidate edges are fitted. One is the border if it comes within 1.5 pixels of the true side, or is
-the nearest to it. The weights are those of a logistic regression for "this is the border" over the edges from the inside
-up to the border. The even views are fitted and the odd ones judged, and the other way round, before all are fitted. No
-photograph takes part. Takes about a second a view; needs palpate[vision,identify].
+Along every side of VIEWS rendered views, and of DRAWN others whose boards may bear a printed grid, a box along the
+border or rows of text, all candidate edges are fitted. One is the border if it is within 1.5 pixels of the true side,
+or is the nearest to it. The weights are those of a logistic regression for "this is the border" over the edges from the
+inside up to the border. The even views are fitted and the odd ones judged, and the other way round, before all are
+fitted. No photograph takes part. Takes about a second a view; needs palpate[vision,identify].
 """
 
 from __future__ import annotations
