@@ -40,8 +40,9 @@ def view(seed: int) -> tuple[np.ndarray, np.ndarray]:
     pick = np.unique(np.concatenate([np.arange(min(BEST, count)), other]))
     right = np.zeros(len(pick), bool)
     if scene.corners is not None:
+        sharp = cv2.cvtColor(scene.image, cv2.COLOR_BGR2GRAY)
         for k, i in enumerate(pick):
-            found = _edges.fit(scene.image, rescaled(quads.corners[i], 1.0 / scale), quads.border[i])
+            found = _edges.fit(sharp, rescaled(quads.corners[i], 1.0 / scale), quads.border[i])
             right[k] = corner_error(found.corners, scene.corners) <= RIGHT
     return quads.features[pick], right
 

@@ -18,6 +18,7 @@ from recordings import recording  # noqa: E402
 
 SIZE = (0.9, 0.6)  # of the writing surface [m]
 PPM = 1000.0  # texture pixels per metre
+SHADOW = np.array([[0, 300], [1280, 80], [1280, 500], [0, 650]])
 VIEW = np.array([[310.0, 120.0], [1010.0, 190.0], [960.0, 610.0], [270.0, 560.0]])
 
 
@@ -147,6 +148,64 @@ def test_a_board_that_reaches_out_of_view_is_not_called_whole():
     if boards:
         assert not boards[0].in_view[1] and boards[0].in_view.sum() == 3
         assert any("out of view" in r for r in vision.see(picture(outside)).remarks())
+
+
+def room(kind):
+    """Walls unlike those of the rendered views."""
+    rng = np.random.default_rng(2)
+    wall = np.full((720, 1280, 3), 190.0)
+    if kind == "tiles":
+        wall[:, ::90], wall[:, 1::90], wall[::90], wall[1::90] = 150.0, 150.0, 150.0, 150.0
+    elif kind == "white door":
+        wall[:] = (150, 165, 170)
+        wall[:, 220:1120] = (228, 230, 231)
+        wall[:, 214:220] = wall[:, 1120:1126] = 120.0
+    elif kind == "posters":
+        for x in (20, 1080):
+            cv2.rectangle(wall, (x, 60), (x + 180, 330), (235, 238, 240), -1)
+            cv2.rectangle(wall, (x, 60), (x + 180, 330), (60, 60, 60), 3)
+    elif kind == "wood":
+        grain = cv2.resize(rng.normal(0, 1, (180, 13)), (1280, 720), interpolation=cv2.INTER_CUBIC)
+        wall = np.array([40.0, 70, 110]) * (1 + 0.05 * grain[..., None])
+    return np.clip(wall + rng.normal(0, 1.5, wall.shape), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["tiles", "white door", "posters", "wood"])
+def test_walls_of_other_kinds(kind):
+    assert error(vision.detect(picture(onto=room(kind)))[0]) < 1.5
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda p: p * np.linspace(0.35, 1.1, 1280)[None, :, None],
+        lambda p: p * (1.0 - 0.65 * np.hypot(*np.mgrid[-0.7:0.7:720j, -0.7:0.7:1280j]) ** 2)[..., None],
+        lambda p: cv2.imdecode(cv2.imencode(".jpg", p, [cv2.IMWRITE_JPEG_QUALITY, 20])[1], cv2.IMREAD_COLOR),
+        lambda p: p + np.random.default_rng(4).normal(0.0, 14.0, p.shape),
+        lambda p: p * (1.0 - 0.4 * cv2.fillPoly(np.zeros(p.shape[:2]), [SHADOW], 1.0))[..., None],
+    ],
+    ids=["window light", "vignette", "compressed", "noisy", "hard shadow"],
+)
+def test_light_and_cameras_of_other_kinds(plain, change):
+    seen = np.clip(change(plain), 0, 255).astype(np.uint8)
+    assert error(vision.detect(seen)[0]) < 1.5
+
+
+def test_a_corner_says_how_sure_it_is(plain):
+    (board,) = vision.detect(plain)
+    assert board.sigma.shape == (4,) and (board.sigma > 0.0).all() and (board.sigma < 3.0).all()
+    # twice the picture, twice the pixels
+    (larger,) = vision.detect(cv2.resize(plain, (2560, 1440), interpolation=cv2.INTER_CUBIC))
+    np.testing.assert_allclose(larger.sigma, 2.0 * board.sigma, rtol=0.5)
+    # stated and true errors belong together
+    views = [board_detection.measure_view(seed) for seed in (3, 4)]
+    off, sigma = np.array([pair for view in views for pair in view.stated]).T
+    assert len(off) == 8 and np.mean(off <= 3.0 * sigma) >= 0.75
+
+
+def test_a_corner_out_of_view_is_no_board():
+    for shift in ((420.0, 260.0), (-500.0, -300.0)):
+        assert vision.detect(picture(VIEW + shift)) == ()
 
 
 def test_most_rendered_views_are_right():
@@ -521,6 +580,29 @@ def test_palpate_see(command, plain, camera, tmp_path):
         code == 0 and "dirty" in out and "not calibrated" in out and (tmp_path / "photo-seen.png").is_file()
     )
     assert command("see", "photo.png", "--quiet")[:2] == (0, "dirty\n")
+
+
+def test_palpate_see_says_what_is_odd(command, plain):
+    """Grey, 10 megapixels, half out of view, two boards, a corner out of view."""
+    left = np.array([[60.0, 100], [560, 120], [550, 520], [70, 540]])
+    right = np.array([[760.0, 250], [1180, 230], [1190, 540], [765, 520]])
+    pictures = {
+        "grey": (cv2.cvtColor(plain, cv2.COLOR_BGR2GRAY), None),
+        "large": (cv2.resize(plain, (4224, 2376), interpolation=cv2.INTER_LINEAR), None),
+        "half": (picture(VIEW - np.array([330.0, 0.0])), "partly out of view"),
+        "two": (picture(right, onto=picture(left)), "2 boards are in view"),
+    }
+    for name, (image, remark) in pictures.items():
+        cv2.imwrite(f"{name}.png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        code, out, _ = command("see", f"{name}.png", "--json")
+        seen = json.loads(out)
+        assert code == 0 and seen["found"] and seen["height"] == image.shape[0], name
+        assert len(seen["boards"][0]["corners_sigma_px"]) == 4
+        assert (remark is None) or any(remark in r for r in seen["remarks"]), name
+        assert any("not calibrated" in r for r in seen["remarks"]), name
+    cv2.imwrite("corner.png", picture(VIEW + np.array([420.0, 260.0])))
+    code, out, err = command("see", "corner.png")
+    assert code == 2 and out == "" and "all of it in view but at most one side" in err
 
 
 def test_palpate_see_says_why_it_cannot(command, plain):

@@ -80,6 +80,7 @@ def run(
     rows: list[tuple[str, Text | str]] = [
         ("board", f"{verdict}, found with confidence {100.0 * sight.board.confidence:.0f} %"),
         ("corners [px]", "  ".join(f"({x:.1f}, {y:.1f})" for x, y in sight.board.corners)),
+        ("their standard deviation [px]", ", ".join(f"{s:.1f}" for s in sight.board.sigma)),
         ("size", f"{sight.plane.size[0]:.3f} x {sight.plane.size[1]:.3f} {unit}"),
         ("ink", f"{len(sight.ink.polygons)} pieces on {100.0 * sight.covered:.2f} % of the surface"),
         ("other things on it", str(len(sight.ink.objects))),

@@ -44,6 +44,8 @@ OVERLAP, PUBLISHED_OVERLAP = 0.95, 0.9
 """intersection over union with the annotated surface"""
 BOXES = 0.97
 """share of the boxes with ink in which some is found"""
+NEARBY = 20.0
+"""[pixels] a corner this near is one of the board; farther off it is another thing"""
 FRAME_LIMIT = 25.0
 """[ms] on one core"""
 
@@ -60,6 +62,8 @@ class View:
     """part of the ink's pixels that were found; NaN: no ink or no board"""
     alarm: float
     """part of the clean surface taken for ink; NaN: no board"""
+    stated: tuple[tuple[float, float], ...]
+    """of every corner the error and its stated standard deviation [pixels]; empty: no board or another thing"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,9 +88,15 @@ class Photo:
     """boxes with ink in which none was found"""
 
 
+def corner_errors(found: Array, true: Array) -> Array:
+    """(4,) distances of the corners found from the true ones, whichever corner is the first [pixels]."""
+    turned = (np.linalg.norm(found - np.roll(true, k, 0), axis=1) for k in range(4))
+    return min(turned, key=lambda off: float(off.max()))
+
+
 def corner_error(found: Array, true: Array) -> float:
-    """Largest distance of corresponding corners, whichever corner is the first [pixels]."""
-    return min(float(np.linalg.norm(np.roll(found, k, 0) - true, axis=1).max()) for k in range(4))
+    """The largest of them [pixels]."""
+    return float(corner_errors(found, true).max())
 
 
 def overlap(a: Array, b: Array) -> float:
@@ -118,7 +128,11 @@ def measure_view(seed: int) -> View:
             recall = float(best.ink.mask[scene.ink].mean())
         if scene.clean.any():
             alarm = float(best.ink.mask[scene.clean].mean())
-    return View(error, not scene.dirty, best.dirty, recall, alarm)
+    stated: tuple[tuple[float, float], ...] = ()
+    if best.board is not None and scene.corners is not None and error["lines"] <= NEARBY:
+        off = corner_errors(best.board.corners, scene.corners)
+        stated = tuple((float(e), float(s)) for e, s in zip(off, best.board.sigma, strict=True))
+    return View(error, not scene.dirty, best.dirty, recall, alarm, stated)
 
 
 def measure_room(seed: int) -> float:
@@ -260,6 +274,7 @@ def _rendered(seen: list[View], empty: Array) -> list[Row]:
     got = ours[np.isfinite(ours)]
     share = {method: 100.0 * float(np.mean(e <= WITHIN)) for method, e in errors.items()}
     verdicts = [v.verdict is not None and v.verdict != v.clean for v in seen]
+    off, sigma = np.array([pair for v in seen for pair in v.stated]).reshape(-1, 2).T
     recall = np.array([v.recall for v in seen])
     alarm = np.array([v.alarm for v in seen])
     return [
@@ -270,6 +285,14 @@ def _rendered(seen: list[View], empty: Array) -> list[Row]:
             "%",
             f"{len(seen)} views; median {np.median(got):.2f} px, no board in {len(ours) - len(got)}, "
             f"within 5 px {100.0 * np.mean(ours <= 5.0):.1f} %",
+        ),
+        told(
+            "rendered: corners off by at most twice their stated deviation",
+            100.0 * float(np.mean(off <= 2.0 * sigma)) if len(off) else float("nan"),
+            "%",
+            beside="98.2",
+            note=f"expected of Gaussian errors; boards within {NEARBY:g} px; error over deviation, root mean square "
+            f"{np.sqrt(np.mean((off / sigma) ** 2)) if len(off) else np.nan:.2f} (1)",
         ),
         told("rendered: the published growing by hue", share["published"], "%"),
         told("rendered: growing by saturation", share["saturation"], "%"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ..arm import Array
@@ -20,7 +21,7 @@ CORNER = 12.0
 """how far around a corner its sides are looked at [pixels]"""
 OUT_OF_VIEW = 0.5
 """support that the picture's border is taken to give a side"""
-SHORTLIST = 128
+SHORTLIST = 64
 """quadrangles looked at more closely"""
 GRID = 12
 """points per direction at which the inside is looked at"""
@@ -68,8 +69,11 @@ def find(lines: Lines, gradient: Gradient, image: Image, grey: Image) -> Quads:
     i, j = np.triu_indices(n, 1)
     # side[a, p]: support of line a between its crossings with the two lines of pair p
     side, ends, valid = support.sides(i, j, SHORTEST * max(width, height))
+    crossed = valid.sum(0) >= 2  # two lines have a side between these two
+    i, j, side, ends, valid = i[crossed], j[crossed], side[:, crossed], ends[:, crossed], valid[:, crossed]
     first = valid[i] & valid[j]  # (pair, pair)
-    p, q = np.nonzero(np.triu(first & first.T, 1))
+    p, q = np.nonzero(first & first.T)
+    p, q = p[p < q], q[p < q]
     keep = border[i[p]].astype(int) + border[j[p]] + border[i[q]] + border[j[q]] <= 1
     p, q = p[keep], q[keep]
     if not len(p):
@@ -125,17 +129,17 @@ class _Support:
         self.origin = centre + (offset - normal @ centre)[:, None] * normal
         self.half = int(np.hypot(width, height) / 2.0) + 20
         self.border = border
-        t = np.arange(-self.half, self.half + 1)
-        hit = np.zeros((len(offset), len(t)), bool)
-        at = self.origin[:, None] + self.along[:, None] * t[None, :, None]
-        for shift in (-1.0, 0.0, 1.0):
-            xy = np.rint(at + shift * normal[:, None]).astype(np.int64)
-            inside = (xy[..., 0] >= 0) & (xy[..., 0] < width) & (xy[..., 1] >= 0) & (xy[..., 1] < height)
-            index = np.clip(xy[..., 1], 0, height - 1) * width + np.clip(xy[..., 0], 0, width - 1)
-            gx, gy = gradient.x.ravel()[index], gradient.y.ravel()[index]
-            across = np.abs(gx * normal[:, :1] + gy * normal[:, 1:])
-            aside = np.abs(gx * normal[:, 1:] - gy * normal[:, :1])
-            hit |= inside & (across > gradient.noise) & (aside < 0.6 * across)
+        t = np.arange(-self.half, self.half + 1, dtype=np.float32)
+        origin, along, across = (x.astype(np.float32)[:, None] for x in (self.origin, self.along, normal))
+        at = origin + along * t[:, None]
+        beside = np.stack([at - across, at, at + across])
+        both = cv2.merge([gradient.x, gradient.y])
+        maps = beside.reshape(-1, len(t), 2)
+        edge = cv2.remap(both, maps, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        gx, gy = np.moveaxis(edge.reshape(*beside.shape), 3, 0)
+        nx, ny = normal.astype(np.float32).T[:, :, None]
+        across, aside = np.abs(gx * nx + gy * ny), np.abs(gx * ny - gy * nx)
+        hit = ((across > gradient.noise) & (aside < 0.6 * across)).any(0)
         support = hit.astype(np.float64)
         support[border] = OUT_OF_VIEW
         self.total = np.concatenate([np.zeros((len(offset), 1)), np.cumsum(support, 1)], 1)

@@ -2,8 +2,8 @@
 
 A board is four straight edges, each supported by the picture along most of its length, that meet at corners and do not
 run on, around a surface that is even and light and has other brightness than what lies beyond. Candidates come from
-the straight lines of a small copy of the picture; they are judged by that evidence, and the best ones are fitted to the
-inner edges of the frame at full resolution.
+the straight lines of a small copy of the picture; they are judged by that evidence, and the borders of the best ones'
+surfaces are looked for at full resolution.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ROUGH = 512
 """longer side of the copy in which boards are looked for [pixels]"""
 FINE = 1280
 """longer side of the copy in which edges are fitted [pixels]"""
-LINES = 34
+LINES = 40
 """straight lines looked at"""
 SURE = 0.3
 """least confidence of a board that is reported"""
@@ -40,6 +40,9 @@ class Board:
     """(4,): the side from corner i to the next is the board's own edge; False: it is where the picture ends"""
     spread: Array
     """(4,) deviation of the edge from a straight line, per side [pixels]"""
+    sigma: Array
+    """(4,) standard deviation of the corners: root of the mean square distance to where they are [pixels]; if it is a
+    board, which is what ``confidence`` is about; NaN: not known"""
 
     @property
     def complete(self) -> bool:
@@ -62,6 +65,7 @@ def detect(image: npt.ArrayLike, *, most: int = 3) -> tuple[Board, ...]:
     rough, scale = shrunk(fine, ROUGH)
     grey = cv2.cvtColor(rough, cv2.COLOR_BGR2GRAY)
     quads = _quads.find(_lines.find(grey, LINES), _lines.gradient(grey), rough, grey)
+    sharp = cv2.cvtColor(fine, cv2.COLOR_BGR2GRAY)
     boards: list[Board] = []
     taken = np.zeros(grey.shape, bool)
     for i in range(len(quads.score)):
@@ -74,7 +78,7 @@ def detect(image: npt.ArrayLike, *, most: int = 3) -> tuple[Board, ...]:
         inside = _filled(quads.corners[i], grey.shape)
         if taken[inside].mean() > 0.1:
             continue
-        edges = _edges.fit(fine, rescaled(quads.corners[i], 1.0 / scale), quads.border[i])
+        edges = _edges.fit(sharp, rescaled(quads.corners[i], 1.0 / scale), quads.border[i])
         taken |= inside
         turn = int(np.argmin(edges.corners.sum(1)))
         boards.append(
@@ -83,6 +87,7 @@ def detect(image: npt.ArrayLike, *, most: int = 3) -> tuple[Board, ...]:
                 confidence,
                 ~np.roll(quads.border[i], -turn),
                 np.roll(edges.spread, -turn) / fine_scale,
+                np.roll(edges.sigma, -turn) / fine_scale,
             )
         )
     return tuple(boards)

@@ -97,6 +97,7 @@ class Sight:
             "boards": [
                 {
                     "corners_px": rounded(b.corners, 2),
+                    "corners_sigma_px": None if np.isnan(b.sigma).any() else rounded(b.sigma, 2),
                     "confidence": round(b.confidence, 4),
                     "complete": b.complete,
                     "side_in_view": b.in_view.tolist(),
@@ -165,7 +166,13 @@ def see(
         return Sight((), None, None, extent)
     turn = int(np.argmin(region.corners.sum(1)))
     corners = rescaled(np.roll(region.corners, -turn, 0), 1.0 / scale)
-    found = Board(corners, 1.0 - region.epsilon / published.EPSILONS[-1], np.ones(4, bool), np.zeros(4))
+    found = Board(
+        corners,
+        1.0 - region.epsilon / published.EPSILONS[-1],
+        np.ones(4, bool),
+        np.zeros(4),
+        np.full(4, np.nan),
+    )
     holes = tuple(rescaled(h, 1.0 / scale) for h in region.holes)
     mask = np.zeros(picture.shape[:2], np.uint8)
     for hole in holes:
