@@ -131,6 +131,7 @@ def test_the_same_seed_is_the_same_board():
     ("wrong", "words"),
     [
         ({"speed": 0.0}, "speed"),
+        ({"speed": 100.0}, "at most 0.3 m/s"),
         ({"normal_force": 5.0}, "normal_force"),
         ({"passes": 0}, "passes"),
         ({"hold": "perhaps"}, "always, needed, never"),

@@ -10,6 +10,10 @@ from ..errors import InputError
 from .strokes import Motion
 
 
+FASTEST = 0.3
+"""[m/s]"""
+
+
 @dataclass(frozen=True, slots=True)
 class JobOptions:
     """How a board is to be wiped.
@@ -50,6 +54,11 @@ class JobOptions:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise InputError(f"wiping: {name} must be finite and > 0, got {value!r}")
+        if self.speed > FASTEST:
+            raise InputError(
+                f"wiping: speed must be at most {FASTEST:g} m/s, beyond which the force is not known to hold, got "
+                f"{self.speed!r}"
+            )
         if not self.normal_force < self.max_force:
             raise InputError(
                 f"wiping: normal_force must be below max_force, {self.max_force:g} N, to leave something for the way, "
