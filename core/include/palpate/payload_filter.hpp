@@ -88,9 +88,18 @@ class PayloadFilter {
     }
     const int steps = 1 + static_cast<int>(s.dt / config_.max_step);
     for (int k = 0; k < steps; ++k) predict(s, s.dt / steps);
-    const double smoothing = -std::expm1(-s.dt / 0.3);
-    filter_.measure_joints(*arm_, s, [this, smoothing](int i, int e, const Filter::Update& update) {
-      if (i < arm_->n()) surprise_[u(i)] += smoothing * (std::min(update.y * update.y / update.s, 100.0) - surprise_[u(i)]);
+    const double smoothing = -std::expm1(-s.dt / memory), quick = -std::expm1(-s.dt / 0.03);
+    JointVector dq{}, ddq{};  // corrections of (q, q')
+    filter_.measure_joints(*arm_, s, [&](int i, int e, const Filter::Update& update) {
+      if (i < arm_->n()) {
+        const double square = std::min(update.y * update.y / update.s, 100.0);
+        surprise_[u(i)] += smoothing * (square - surprise_[u(i)]);
+        recent_surprise_[u(i)] += quick * (square - recent_surprise_[u(i)]);
+      }
+      for (int j = 0; j < arm_->n(); ++j) {
+        dq[u(j)] += update.K[j] * update.y;
+        ddq[u(j)] += update.K[arm_->n() + j] * update.y;
+      }
       for (Hypothesis& hyp : hypotheses_) {
         const double seen = hyp.e[u(i)] + (e >= 0 ? hyp.e[u(e)] : 0.0);
         hyp.num += seen * update.y / update.s;
@@ -103,6 +112,7 @@ class PayloadFilter {
       begin(s);
       return report(s, Status::warming);
     }
+    look_for_unexplained(filter_.torque_of(dq, ddq, s.dt), s.dt);
     learn_model_error(s.dt);
     unexplained_time_ = explained() ? 0.0 : unexplained_time_ + s.dt;
     // Lost: it explains nothing, or by a load that weighs less than nothing.
@@ -171,9 +181,11 @@ class PayloadFilter {
     for (int i = 0; i < biases_; ++i) redraw_bias(i);
     started_ = true;
     restart_hypotheses();
+    restart_unexplained();
   }
   void forget_everything() noexcept {
     surprise_.fill(1.0);
+    recent_surprise_.fill(1.0);
     unexplained_variance_ = unexplained_time_ = 0.0;
     mass_before_ = known_time_ = 0.0;
     mass_prior_std_ = initial_prior_std_;
@@ -247,9 +259,10 @@ class PayloadFilter {
       if (regime_.changed(*arm_, i, filter_.q(i), filter_.dq(i))) redraw_bias(i);
       decay_[u(loads_ + i)] = phi;
     }
-    JointVector variance = torque_variance_;
+    noise_ = torque_variance_;
+    add_neglected(noise_, h);
+    JointVector variance = noise_;
     for (int i = 0; i < arm_->n(); ++i) variance[u(i)] += model_error_[u(i)];
-    add_neglected(variance, h);
     const Inertia<double> state = load_of_state(), real = moving(state);
     const Inertia<double> rest{state.m - real.m, state.mc - real.mc, Sym3<double>{}};
     const int last = arm_->n() - 1;
@@ -267,17 +280,91 @@ class PayloadFilter {
     }
   }
 
-  /// An arm whose model is wrong surprises its filter: the innovations' y^2/S, 1 on average, stays above it. A torque
-  /// variance per joint then grows until they fit, fast, and shrinks again, slowly. The filter takes it for white; but it may
-  /// as well stay, so that no averaging removes it: the interval that is reported counts it once more, as a constant torque.
+  /// An arm whose model is wrong, or that is pushed, surprises its filter: the innovations' y^2/S, 1 on average, stays above it.
+  /// A torque variance per joint then grows until they fit, at once, and shrinks again: to what the unexplained torque shows
+  /// within the time that is known over, below that slowly. The filter takes it for white; but it may as well stay, so that no
+  /// averaging removes it: what it does to the mass is told by look_for_unexplained().
   void learn_model_error(double dt) noexcept {
     for (int i = 0; i < arm_->n(); ++i) {
-      const double excess = surprise_[u(i)] - 1.3;
-      const double rate = excess > 0.0 ? std::min(excess, 3.0) / 0.02 : std::max(excess, -1.0) / 1.0;
-      const double factor = std::exp(std::min(rate * dt, 2.0));
-      model_error_[u(i)] = std::clamp(model_error_[u(i)] * factor, least_model_error, 1e6);
+      double& variance = model_error_[u(i)];
+      const double excess = std::min(surprise_[u(i)], recent_surprise_[u(i)]) - 1.3;
+      if (excess > 0.0) {
+        variance *= std::exp(std::min(std::min(excess, 3.0) / 0.02 * dt, 2.0));
+      } else {
+        const double shown = 3.0 * lacking_[u(i)] * lacking_[u(i)];
+        const double rate = variance > shown ? -1.0 / memory : std::max(surprise_[u(i)] - 1.3, -1.0);
+        variance *= std::exp(rate * dt);
+      }
+      variance = std::clamp(variance, least_model_error, 1e6);
     }
   }
+
+  void restart_unexplained() noexcept {
+    span_ = 0.0;
+    seen_torque_ = lacking_ = white_ = {};
+    seen_lever_ = {};
+    start_weight_ = 1.0;
+    for (int i = 0; i < arm_->n(); ++i) {
+      start_q_[u(i)] = filter_.variance(i);
+      start_dq_[u(i)] = filter_.variance(arm_->n() + i);
+    }
+  }
+  /// A push is no mass: its torques stand to each other as no load's do. What the state lacks to follow the positions, the
+  /// torque that its corrections amount to, is what the arm alone leaves unexplained, less the load's D theta and the
+  /// friction's b. Over the last `memory` seconds
+  ///   r = mean(torque - D theta^ + b^),  rho = r + mean(D) theta^ ~ N(0, V)
+  ///   V = noise / N + var(D theta) + var(b) + 2 var(M q')/memory^2
+  /// if it is a load and nothing else. Where sum(rho^2/V) says otherwise, any part of what looks like a mass may be none:
+  /// it counts as sum(rho^2)/sum(D^2), the mass that would be as large.
+  void look_for_unexplained(const JointVector& lacking, double dt) noexcept {
+    const int n = arm_->n();
+    for (int i = 0; i < n; ++i)  // the velocities were still unknown, and what was corrected was nobody's torque
+      if (filter_.variance(n + i) < 0.25 * start_dq_[u(i)] && span_ < memory) {
+        restart_unexplained();
+        break;
+      }
+    span_ = std::min(span_ + dt, memory);
+    const double a = std::min(dt / span_, 1.0);
+    start_weight_ = span_ < memory ? a : start_weight_ * (1.0 - a);
+    double chi_square = 0.0, unexplained = 0.0, lever = 0.0, like_mass = 0.0;
+    for (int i = 0; i < n; ++i) {
+      const auto& D = lever_[u(i)];
+      auto& mean = seen_lever_[u(i)];
+      double torque = lacking[u(i)] + (biases_ > 0 ? filter_.parameter(loads_ + i) : 0.0), rho = 0.0, V = 0.0;
+      for (int k = 0; k < loads_; ++k) {
+        torque -= D[u(k)] * filter_.parameter(k);
+        mean[u(k)] += a * (D[u(k)] - mean[u(k)]);
+        rho += mean[u(k)] * filter_.parameter(k);
+        for (int l = 0; l < loads_; ++l) V += mean[u(k)] * mean[u(l)] * filter_.covariance(2 * n + k, 2 * n + l);
+      }
+      lacking_[u(i)] += a * (lacking[u(i)] - lacking_[u(i)]);
+      seen_torque_[u(i)] += a * (torque - seen_torque_[u(i)]);
+      rho += seen_torque_[u(i)];
+      white_[u(i)] = (1.0 - a) * (1.0 - a) * white_[u(i)] + a * a * noise_[u(i)];
+      const double M = filter_.inertia()[u(i)], B = filter_.damping()[u(i)];
+      const double now = M * M * filter_.variance(n + i) + B * B * filter_.variance(i);
+      const double start = M * M * start_dq_[u(i)] + B * B * start_q_[u(i)];
+      V += white_[u(i)] + now / (span_ * span_) + start * start_weight_ * start_weight_ / (dt * dt);
+      if (biases_ > 0) V += bias_variance(i);
+      chi_square += rho * rho / V;
+      unexplained += rho * rho;
+      lever += mean[0] * mean[0];
+      like_mass -= mean[0] * rho;
+    }
+    const double part = 2.0 / (9.0 * n), cube = 1.0 - part + 5.0 * std::sqrt(part);
+    if (chi_square > n * cube * cube * cube) {
+      unexplained_variance_ = std::max(unexplained_variance_, unexplained / std::max(lever, 1e-12));
+      quiet_ = 0.0;
+      like_mass /= std::max(lever, 1e-12);
+      const double rest = unexplained - like_mass * like_mass * lever;
+      const double missing = like_mass * like_mass - filter_.parameter_variance(0);
+      if (like_mass * like_mass * lever * (n - 1) > 4.0 * rest && missing > 0.0) filter_.add_parameter_variance(0, missing);
+    } else {
+      quiet_ += dt;
+    }
+    unexplained_variance_ = quiet_ > memory ? 0.0 : unexplained_variance_ * std::exp(-dt / memory);
+  }
+
   /// Whether the state explains what every joint does now.
   bool explained() const noexcept {
     return std::all_of(surprise_.begin(), surprise_.begin() + arm_->n(), [](double s) { return s < 2.0; });
@@ -317,16 +404,19 @@ class PayloadFilter {
       }
     }
     most_share_ = 0.0;
-    double information = 0.0;  // about the mass, were the learnt model error a constant torque [1/kg^2]
+    const Mat3<double> R = P.R * arm_->R_last_tip();
+    const std::array<Vec3<double>, 3> tip{R.cx, R.cy, R.cz};
     for (int i = 0; i < arm_->n(); ++i) {
-      const double torque = dot(J[u(i)], a_c - g), share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
+      const double torque = dot(J[u(i)], a_c - g);
+      lever_[u(i)][0] = torque;
+      if (!arm_->body(i).prismatic)
+        for (int k = 1; k < loads_; ++k) lever_[u(i)][u(k)] = dot(cross(P.axis[u(i)], tip[u(k - 1)]), a_c - g);
+      const double share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
       most_share_ = std::max(most_share_, share);
       variance[u(i)] += samples * mass_variance * torque * torque * std::min(1.0, mass_variance * share * share);
       const double turning = arm_->body(i).prismatic ? 0.0 : own_inertia * dot(P.axis[u(i)], spin);
       variance[u(i)] += samples * turning * turning;
-      information += torque * torque / std::max(model_error_[u(i)] - least_model_error, 1e-12);
     }
-    unexplained_variance_ = 1.0 / std::max(information, 1e-12);
   }
 
   void start_hypothesis(Hypothesis& hyp, std::int64_t now) noexcept {
@@ -380,6 +470,7 @@ class PayloadFilter {
       if (!correction) set_offset_prior();
       mass_before_ = filter_.parameter(0);
       restart_hypotheses();
+      restart_unexplained();
       return;
     }
     for (Hypothesis& hyp : hypotheses_)
@@ -401,7 +492,7 @@ class PayloadFilter {
     out.status = status;
     const bool sure = out.mass_std <= std::max(config_.ok_relative * std::abs(out.mass), config_.ok_absolute);
     const bool possible = out.mass >= -std::max(3.0 * out.mass_std, config_.ok_absolute);
-    if (status == Status::ok && !(sure && possible && explained())) out.status = Status::warming;
+    if (status == Status::ok && !(sure && possible && explained() && span_ >= 0.1)) out.status = Status::warming;
     return out;
   }
 
@@ -412,7 +503,12 @@ class PayloadFilter {
   Filter filter_;
   std::array<Inertia<double>, 4> unit_;
   static constexpr double least_model_error = 1e-6;  // [N^2 m^2]
-  JointVector tau_{}, torque_variance_{}, surprise_{}, model_error_{};
+  static constexpr double memory = 0.3;              // over which surprise and unexplained torque are averaged [s]
+  JointVector tau_{}, torque_variance_{}, surprise_{}, recent_surprise_{}, model_error_{};
+  JointVector noise_{};                               // of the torque without the model error, per step [N^2 m^2]
+  std::array<std::array<double, 4>, max_joints> lever_{}, seen_lever_{};  // torque per parameter of the load; over the memory
+  JointVector lacking_{}, seen_torque_{}, white_{}, start_q_{}, start_dq_{};
+  double span_ = 0.0, start_weight_ = 1.0, quiet_ = 0.0;
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
   static constexpr double lag = 0.1;          // errors of linearisation last about so long [s]
