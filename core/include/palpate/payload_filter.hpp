@@ -186,7 +186,7 @@ class PayloadFilter {
   void forget_everything() noexcept {
     surprise_.fill(1.0);
     recent_surprise_.fill(1.0);
-    unexplained_variance_ = unexplained_time_ = 0.0;
+    unexplained_variance_ = hidden_variance_ = unexplained_time_ = 0.0;
     mass_before_ = known_time_ = 0.0;
     mass_prior_std_ = initial_prior_std_;
     model_error_.fill(least_model_error);
@@ -287,14 +287,11 @@ class PayloadFilter {
   void learn_model_error(double dt) noexcept {
     for (int i = 0; i < arm_->n(); ++i) {
       double& variance = model_error_[u(i)];
-      const double excess = std::min(surprise_[u(i)], recent_surprise_[u(i)]) - 1.3;
-      if (excess > 0.0) {
-        variance *= std::exp(std::min(std::min(excess, 3.0) / 0.02 * dt, 2.0));
-      } else {
-        const double shown = 3.0 * lacking_[u(i)] * lacking_[u(i)];
-        const double rate = variance > shown ? -1.0 / memory : std::max(surprise_[u(i)] - 1.3, -1.0);
-        variance *= std::exp(rate * dt);
-      }
+      const double lacks = std::max(std::abs(lacking_[u(i)]), std::abs(lacking_now_[u(i)]));
+      const double shown = 4.0 * lacks * lacks, excess = std::min(surprise_[u(i)], recent_surprise_[u(i)]) - 1.3;
+      if (variance > shown) variance = std::max(shown, variance * std::exp(-dt / memory));
+      else if (excess > 0.0) variance = std::min(shown, variance * std::exp(std::min(std::min(excess, 3.0) / 0.02 * dt, 2.0)));
+      else variance *= std::exp(dt * std::max(surprise_[u(i)] - 1.3, -1.0));
       variance = std::clamp(variance, least_model_error, 1e6);
     }
   }
@@ -324,9 +321,10 @@ class PayloadFilter {
         break;
       }
     span_ = std::min(span_ + dt, memory);
-    const double a = std::min(dt / span_, 1.0);
+    const double a = std::min(dt / span_, 1.0), quick = -std::expm1(-dt / 0.03);
     start_weight_ = span_ < memory ? a : start_weight_ * (1.0 - a);
-    double chi_square = 0.0, unexplained = 0.0, lever = 0.0, like_mass = 0.0;
+    /*DBG*/ std::size_t dbg = 0;
+    double chi_square = 0.0, unexplained = 0.0, hidden = 0.0, lever = 0.0, like_mass = 0.0;
     for (int i = 0; i < n; ++i) {
       const auto& D = lever_[u(i)];
       auto& mean = seen_lever_[u(i)];
@@ -338,6 +336,7 @@ class PayloadFilter {
         for (int l = 0; l < loads_; ++l) V += mean[u(k)] * mean[u(l)] * filter_.covariance(2 * n + k, 2 * n + l);
       }
       lacking_[u(i)] += a * (lacking[u(i)] - lacking_[u(i)]);
+      lacking_now_[u(i)] += quick * (lacking[u(i)] - lacking_now_[u(i)]);
       seen_torque_[u(i)] += a * (torque - seen_torque_[u(i)]);
       rho += seen_torque_[u(i)];
       white_[u(i)] = (1.0 - a) * (1.0 - a) * white_[u(i)] + a * a * noise_[u(i)];
@@ -347,11 +346,15 @@ class PayloadFilter {
       V += white_[u(i)] + now / (span_ * span_) + start * start_weight_ * start_weight_ / (dt * dt);
       if (biases_ > 0) V += bias_variance(i);
       chi_square += rho * rho / V;
+      /*DBG*/ rho_[u(i)] = rho; V_[u(i)] = V; (void)dbg;
       unexplained += rho * rho;
+      const double learnt = model_error_[u(i)] - least_model_error;
+      hidden += V * learnt / (learnt + noise_[u(i)] + 1e-12);
       lever += mean[0] * mean[0];
       like_mass -= mean[0] * rho;
     }
-    const double part = 2.0 / (9.0 * n), cube = 1.0 - part + 5.0 * std::sqrt(part);
+    /*DBG*/ debug_[0] = chi_square; debug_[1] = like_mass / std::max(lever, 1e-12);
+    const double part = 2.0 / (9.0 * n), cube = 1.0 - part + 4.0 * std::sqrt(part);
     if (chi_square > n * cube * cube * cube) {
       unexplained_variance_ = std::max(unexplained_variance_, unexplained / std::max(lever, 1e-12));
       quiet_ = 0.0;
@@ -363,6 +366,7 @@ class PayloadFilter {
       quiet_ += dt;
     }
     unexplained_variance_ = quiet_ > memory ? 0.0 : unexplained_variance_ * std::exp(-dt / memory);
+    hidden_variance_ = hidden / std::max(lever, 1e-12);
   }
 
   /// Whether the state explains what every joint does now.
@@ -482,7 +486,7 @@ class PayloadFilter {
   Payload report(const JointSample&, Status status) const noexcept {
     Payload out;
     out.mass = filter_.parameter(0);
-    out.mass_std = std::hypot(mass_std(), std::sqrt(unexplained_variance_), out.mass - mass_before_);
+    out.mass_std = std::hypot(mass_std(), std::sqrt(unexplained_variance_ + hidden_variance_), out.mass - mass_before_);
     for (int k = 1; k < loads_; ++k) {
       out.first_moment[u(k - 1)] = filter_.parameter(k);
       out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0));
@@ -507,7 +511,8 @@ class PayloadFilter {
   JointVector tau_{}, torque_variance_{}, surprise_{}, recent_surprise_{}, model_error_{};
   JointVector noise_{};                               // of the torque without the model error, per step [N^2 m^2]
   std::array<std::array<double, 4>, max_joints> lever_{}, seen_lever_{};  // torque per parameter of the load; over the memory
-  JointVector lacking_{}, seen_torque_{}, white_{}, start_q_{}, start_dq_{};
+  JointVector lacking_{}, lacking_now_{}, seen_torque_{}, white_{}, start_q_{}, start_dq_{};
+  /*DBG*/ JointVector rho_{}, V_{}; std::array<double,4> debug_{};
   double span_ = 0.0, start_weight_ = 1.0, quiet_ = 0.0;
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
@@ -519,6 +524,7 @@ class PayloadFilter {
   std::uint32_t changes_ = 0;
   std::int64_t change_time_ns_ = 0, change_seen_ns_ = 0;
   double last_jump_ = 0.0;  // [kg]
+  double hidden_variance_ = 0.0;
   double unexplained_variance_ = 0.0;  // of the mass, by what the model gets wrong [kg^2]
   double unexplained_time_ = 0.0;      // [s]
   double mass_before_ = 0.0;           // the estimate about `lag` ago [kg]

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .. import weigh
-from .._core import PayloadFilter, Status
+from .._core import ExtendedKalman, PayloadFilter, Status
 from ..arm import Arm, Array
 from ..drivers.mujoco import MujocoDriver
 from ..logs import Log
@@ -146,6 +146,7 @@ def simulate(job: Job) -> tuple[Pushed, Arm, Log]:
     held = arm.core.load(mass, np.ascontiguousarray(arm.grasp))
     count = round(task.duration * task.rate)
     rows = np.empty((count, 2, arm.n))
+    observer = Pipeline(arm, observer=ExtendedKalman(), payload=None)
     with driver:
         driver.enable()
         for k in range(count):
@@ -153,7 +154,8 @@ def simulate(job: Job) -> tuple[Pushed, Arm, Log]:
             assert sample is not None  # nothing is lost on this bench
             rows[k] = sample.position, sample.effort
             time = k / task.rate
-            torque, _ = control.step(time, route.sample(time), driver.plant, held, 1.0 / task.rate)
+            state = observer.step(sample)
+            torque, _ = control.step(time, route.sample(time), state, held, 1.0 / task.rate)
             driver.write(torque)
     time_ns = np.rint(np.arange(count) * (1e9 / task.rate)).astype(np.int64)
     log = Log(time_ns=time_ns, position=rows[:, 0], effort=rows[:, 1], joint_names=arm.joint_names)

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -224,20 +224,6 @@ class Route:
         return begin + leg.duration
 
 
-class State(Protocol):
-    """Where the arm is, as estimated or in truth."""
-
-    @property
-    def q(self) -> Array:
-        """(n,) [rad]"""
-        ...
-
-    @property
-    def dq(self) -> Array:
-        """(n,) [rad/s]"""
-        ...
-
-
 class RouteControl:
     """Controllers along the route, each with the gains of its stretch, and the safety limiter behind them."""
 
@@ -261,7 +247,7 @@ class RouteControl:
         return known
 
     def step(
-        self, time: float, setpoint: Setpoint, state: State, load: _CoreLoad, dt: float
+        self, time: float, setpoint: Setpoint, state: Touch, load: _CoreLoad, dt: float
     ) -> tuple[Array, Status]:
         """Torque to be sent [N m], and its status."""
         controller = self._controller(min(int(time / self._stretch), self._last))
