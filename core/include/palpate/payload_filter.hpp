@@ -175,13 +175,21 @@ class PayloadFilter {
     std::int64_t since;                     ///< [ns]
   };
 
+  /// What was left unexplained over the last `memory` seconds.
+  struct Window {
+    double memory;                                            ///< [s]
+    double span = 0.0, start_weight = 1.0;                    ///< so far [s]; of the first sample
+    JointVector torque{}, white{}, rho{}, start_q{}, start_dq{};
+    std::array<std::array<double, 4>, max_joints> lever{};
+  };
+
   void begin(const JointSample& s) noexcept {
     filter_.start(*arm_, s, config_.velocity_prior_std);
     regime_ = detail::Regime(presliding);
     for (int i = 0; i < biases_; ++i) redraw_bias(i);
     started_ = true;
     restart_hypotheses();
-    restart_unexplained();
+    restart_windows();
   }
   void forget_everything() noexcept {
     surprise_.fill(1.0);
@@ -287,7 +295,7 @@ class PayloadFilter {
   void learn_model_error(double dt) noexcept {
     for (int i = 0; i < arm_->n(); ++i) {
       double& variance = model_error_[u(i)];
-      const double lacks = std::max(std::abs(lacking_[u(i)]), std::abs(lacking_now_[u(i)]));
+      const double lacks = std::max(std::abs(windows_[0].rho[u(i)]), std::abs(lacking_now_[u(i)]));
       const double shown = 4.0 * lacks * lacks, excess = std::min(surprise_[u(i)], recent_surprise_[u(i)]) - 1.3;
       if (variance > shown) variance = std::max(shown, variance * std::exp(-dt / memory));
       else if (excess > 0.0) variance = std::min(shown, variance * std::exp(std::min(std::min(excess, 3.0) / 0.02 * dt, 2.0)));
@@ -296,77 +304,98 @@ class PayloadFilter {
     }
   }
 
-  void restart_unexplained() noexcept {
-    span_ = 0.0;
-    seen_torque_ = lacking_ = white_ = {};
-    seen_lever_ = {};
-    start_weight_ = 1.0;
+  void restart(Window& w) noexcept {
+    w.span = 0.0;
+    w.start_weight = 1.0;
+    w.torque = w.white = w.rho = {};
+    w.lever = {};
     for (int i = 0; i < arm_->n(); ++i) {
-      start_q_[u(i)] = filter_.variance(i);
-      start_dq_[u(i)] = filter_.variance(arm_->n() + i);
+      w.start_q[u(i)] = filter_.variance(i);
+      w.start_dq[u(i)] = filter_.variance(arm_->n() + i);
     }
+  }
+  void restart_windows() noexcept {
+    for (Window& w : windows_) restart(w);
   }
   /// A push is no mass: its torques stand to each other as no load's do. What the state lacks to follow the positions, the
   /// torque that its corrections amount to, is what the arm alone leaves unexplained, less the load's D theta and the
-  /// friction's b. Over the last `memory` seconds
+  /// friction's b. Over the last 0.3 s, and 3 s,
   ///   r = mean(torque - D theta^ + b^),  rho = r + mean(D) theta^ ~ N(0, V)
-  ///   V = noise / N + var(D theta) + var(b) + 2 var(M q')/memory^2
-  /// if it is a load and nothing else. Where sum(rho^2/V) says otherwise, any part of what looks like a mass may be none:
-  /// it counts as sum(rho^2)/sum(D^2), the mass that would be as large.
+  ///   V = noise / N + 2 var(M q')/span^2 + var(b) + D var(theta) D^T
+  /// if it is a load and nothing else. Where rho^T V^-1 rho says otherwise, any part of what looks like a mass may be none:
+  /// it counts as rho^2/D^2, the mass that would be as large.
   void look_for_unexplained(const JointVector& lacking, double dt) noexcept {
     const int n = arm_->n();
     for (int i = 0; i < n; ++i)  // the velocities were still unknown, and what was corrected was nobody's torque
-      if (filter_.variance(n + i) < 0.25 * start_dq_[u(i)] && span_ < memory) {
-        restart_unexplained();
+      if (filter_.variance(n + i) < 0.25 * windows_[0].start_dq[u(i)] && windows_[0].span < windows_[0].memory) {
+        restart_windows();
         break;
       }
-    span_ = std::min(span_ + dt, memory);
-    const double a = std::min(dt / span_, 1.0), quick = -std::expm1(-dt / 0.03);
-    start_weight_ = span_ < memory ? a : start_weight_ * (1.0 - a);
-    /*DBG*/ std::size_t dbg = 0;
-    double chi_square = 0.0, unexplained = 0.0, hidden = 0.0, lever = 0.0, like_mass = 0.0;
+    quiet_ += dt;
+    unexplained_variance_ *= std::exp(-dt / windows_[0].memory);
+    for (Window& w : windows_) {
+      if (average(w, lacking, dt)) {
+        quiet_ = 0.0;
+        if (&w == &windows_[0]) restart(windows_[1]);
+      }
+    }
+    if (quiet_ > windows_[0].memory) unexplained_variance_ = 0.0;
+    const double quick = -std::expm1(-dt / 0.03);
+    for (int i = 0; i < n; ++i) lacking_now_[u(i)] += quick * (lacking[u(i)] - lacking_now_[u(i)]);
+  }
+  /// Takes in a sample; whether what a window has seen is no load.
+  bool average(Window& w, const JointVector& lacking, double dt) noexcept {
+    const int n = arm_->n();
+    w.span = std::min(w.span + dt, w.memory);
+    const double a = std::min(dt / w.span, 1.0);
+    w.start_weight = w.span < w.memory ? a : w.start_weight * (1.0 - a);
+    JointMatrix V{};
+    double unexplained = 0.0, hidden = 0.0, lever = 0.0, like_mass = 0.0;
+    std::array<std::array<double, 4>, max_joints> DP;
     for (int i = 0; i < n; ++i) {
       const auto& D = lever_[u(i)];
-      auto& mean = seen_lever_[u(i)];
-      double torque = lacking[u(i)] + (biases_ > 0 ? filter_.parameter(loads_ + i) : 0.0), rho = 0.0, V = 0.0;
+      auto& mean = w.lever[u(i)];
+      double torque = lacking[u(i)] + (biases_ > 0 ? filter_.parameter(loads_ + i) : 0.0);
+      double& rho = w.rho[u(i)];
+      rho = 0.0;
       for (int k = 0; k < loads_; ++k) {
         torque -= D[u(k)] * filter_.parameter(k);
         mean[u(k)] += a * (D[u(k)] - mean[u(k)]);
         rho += mean[u(k)] * filter_.parameter(k);
-        for (int l = 0; l < loads_; ++l) V += mean[u(k)] * mean[u(l)] * filter_.covariance(2 * n + k, 2 * n + l);
       }
-      lacking_[u(i)] += a * (lacking[u(i)] - lacking_[u(i)]);
-      lacking_now_[u(i)] += quick * (lacking[u(i)] - lacking_now_[u(i)]);
-      seen_torque_[u(i)] += a * (torque - seen_torque_[u(i)]);
-      rho += seen_torque_[u(i)];
-      white_[u(i)] = (1.0 - a) * (1.0 - a) * white_[u(i)] + a * a * noise_[u(i)];
+      for (int k = 0; k < loads_; ++k) {
+        DP[u(i)][u(k)] = 0.0;
+        for (int l = 0; l < loads_; ++l) DP[u(i)][u(k)] += mean[u(l)] * filter_.covariance(2 * n + l, 2 * n + k);
+      }
+      w.torque[u(i)] += a * (torque - w.torque[u(i)]);
+      rho += w.torque[u(i)];
+      w.white[u(i)] = (1.0 - a) * (1.0 - a) * w.white[u(i)] + a * a * noise_[u(i)];
       const double M = filter_.inertia()[u(i)], B = filter_.damping()[u(i)];
       const double now = M * M * filter_.variance(n + i) + B * B * filter_.variance(i);
-      const double start = M * M * start_dq_[u(i)] + B * B * start_q_[u(i)];
-      V += white_[u(i)] + now / (span_ * span_) + start * start_weight_ * start_weight_ / (dt * dt);
-      if (biases_ > 0) V += bias_variance(i);
-      chi_square += rho * rho / V;
-      /*DBG*/ rho_[u(i)] = rho; V_[u(i)] = V; (void)dbg;
-      unexplained += rho * rho;
+      const double start = M * M * w.start_dq[u(i)] + B * B * w.start_q[u(i)];
+      V(i, i) = w.white[u(i)] + now / (w.span * w.span) + start * w.start_weight * w.start_weight / (dt * dt);
       const double learnt = model_error_[u(i)] - least_model_error;
-      hidden += V * learnt / (learnt + noise_[u(i)] + 1e-12);
+      hidden += V(i, i) * learnt / (learnt + noise_[u(i)] + 1e-12);
+      if (biases_ > 0) V(i, i) += bias_variance(i);
+      for (int j = 0; j <= i; ++j)
+        for (int k = 0; k < loads_; ++k) V(i, j) += DP[u(i)][u(k)] * w.lever[u(j)][u(k)];
+      unexplained += rho * rho;
       lever += mean[0] * mean[0];
       like_mass -= mean[0] * rho;
     }
-    /*DBG*/ debug_[0] = chi_square; debug_[1] = like_mass / std::max(lever, 1e-12);
+    if (&w == &windows_[0]) hidden_variance_ = hidden / std::max(lever, 1e-12);
+    const JointVector x = Cholesky<double>(V, n).solve(w.rho);
+    double chi_square = 0.0;
+    for (int i = 0; i < n; ++i) chi_square += x[u(i)] * w.rho[u(i)];
+    /*DBG*/ if (&w == &windows_[0]) { debug_[0] = chi_square; rho_ = w.rho; for (int i = 0; i < n; ++i) V_[u(i)] = V(i, i); } else debug_[1] = chi_square;
     const double part = 2.0 / (9.0 * n), cube = 1.0 - part + 4.0 * std::sqrt(part);
-    if (chi_square > n * cube * cube * cube) {
-      unexplained_variance_ = std::max(unexplained_variance_, unexplained / std::max(lever, 1e-12));
-      quiet_ = 0.0;
-      like_mass /= std::max(lever, 1e-12);
-      const double rest = unexplained - like_mass * like_mass * lever;
-      const double missing = like_mass * like_mass - filter_.parameter_variance(0);
-      if (like_mass * like_mass * lever * (n - 1) > 4.0 * rest && missing > 0.0) filter_.add_parameter_variance(0, missing);
-    } else {
-      quiet_ += dt;
-    }
-    unexplained_variance_ = quiet_ > memory ? 0.0 : unexplained_variance_ * std::exp(-dt / memory);
-    hidden_variance_ = hidden / std::max(lever, 1e-12);
+    if (!(chi_square > n * cube * cube * cube)) return false;
+    unexplained_variance_ = std::max(unexplained_variance_, unexplained / std::max(lever, 1e-12));
+    like_mass /= std::max(lever, 1e-12);
+    const double rest = unexplained - like_mass * like_mass * lever;
+    const double missing = like_mass * like_mass - filter_.parameter_variance(0);
+    if (like_mass * like_mass * lever * (n - 1) > 4.0 * rest && missing > 0.0) filter_.add_parameter_variance(0, missing);
+    return true;
   }
 
   /// Whether the state explains what every joint does now.
@@ -474,7 +503,7 @@ class PayloadFilter {
       if (!correction) set_offset_prior();
       mass_before_ = filter_.parameter(0);
       restart_hypotheses();
-      restart_unexplained();
+      restart_windows();
       return;
     }
     for (Hypothesis& hyp : hypotheses_)
@@ -496,7 +525,7 @@ class PayloadFilter {
     out.status = status;
     const bool sure = out.mass_std <= std::max(config_.ok_relative * std::abs(out.mass), config_.ok_absolute);
     const bool possible = out.mass >= -std::max(3.0 * out.mass_std, config_.ok_absolute);
-    if (status == Status::ok && !(sure && possible && explained() && span_ >= 0.1)) out.status = Status::warming;
+    if (status == Status::ok && !(sure && possible && explained() && windows_[0].span >= 0.1)) out.status = Status::warming;
     return out;
   }
 
@@ -510,10 +539,11 @@ class PayloadFilter {
   static constexpr double memory = 0.3;              // over which surprise and unexplained torque are averaged [s]
   JointVector tau_{}, torque_variance_{}, surprise_{}, recent_surprise_{}, model_error_{};
   JointVector noise_{};                               // of the torque without the model error, per step [N^2 m^2]
-  std::array<std::array<double, 4>, max_joints> lever_{}, seen_lever_{};  // torque per parameter of the load; over the memory
-  JointVector lacking_{}, lacking_now_{}, seen_torque_{}, white_{}, start_q_{}, start_dq_{};
+  std::array<std::array<double, 4>, max_joints> lever_{};  // torque per parameter of the load
+  JointVector lacking_now_{};
+  std::array<Window, 2> windows_{{{0.3}, {3.0}}};
   /*DBG*/ JointVector rho_{}, V_{}; std::array<double,4> debug_{};
-  double span_ = 0.0, start_weight_ = 1.0, quiet_ = 0.0;
+  double quiet_ = 0.0;
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
   static constexpr double lag = 0.1;          // errors of linearisation last about so long [s]
