@@ -332,13 +332,10 @@ class PayloadFilter {
         break;
       }
     quiet_ += dt;
-    unexplained_variance_ *= std::exp(-dt / windows_[0].memory);
-    for (Window& w : windows_) {
-      if (average(w, lacking, dt)) {
-        quiet_ = 0.0;
-        if (&w == &windows_[0]) restart(windows_[1]);
-      }
-    }
+    unexplained_variance_ *= std::exp(-dt / 0.1);
+    const bool now = average(windows_[0], lacking, dt), lasting = average(windows_[1], lacking, dt);
+    if (now || lasting) quiet_ = 0.0;
+    if (now || changed_) restart(windows_[1]);
     if (quiet_ > windows_[0].memory) unexplained_variance_ = 0.0;
     const double quick = -std::expm1(-dt / 0.03);
     for (int i = 0; i < n; ++i) lacking_now_[u(i)] += quick * (lacking[u(i)] - lacking_now_[u(i)]);
@@ -384,13 +381,25 @@ class PayloadFilter {
       like_mass -= mean[0] * rho;
     }
     if (&w == &windows_[0]) hidden_variance_ = hidden / std::max(lever, 1e-12);
-    const JointVector x = Cholesky<double>(V, n).solve(w.rho);
-    double chi_square = 0.0;
-    for (int i = 0; i < n; ++i) chi_square += x[u(i)] * w.rho[u(i)];
+    if (w.span < 0.1) return false;
+    const Cholesky<double> factor(V, n);
+    const auto chi_square_of = [&](const JointVector& x) {
+      const JointVector y = factor.solve(x);
+      double sum = 0.0;
+      for (int i = 0; i < n; ++i) sum += x[u(i)] * y[u(i)];
+      return sum;
+    };
+    const double part = 2.0 / (9.0 * n), cube = 1.0 - part + 4.0 * std::sqrt(part), limit = n * cube * cube * cube;
+    const double chi_square = chi_square_of(w.rho);
+    if (&w == &windows_[0]) {
+      JointVector change{};
+      for (int i = 0; i < n; ++i) change[u(i)] = windows_[1].rho[u(i)] - w.rho[u(i)];
+      changed_ = chi_square_of(change) > limit;
+    }
     /*DBG*/ if (&w == &windows_[0]) { debug_[0] = chi_square; rho_ = w.rho; for (int i = 0; i < n; ++i) V_[u(i)] = V(i, i); } else debug_[1] = chi_square;
-    const double part = 2.0 / (9.0 * n), cube = 1.0 - part + 4.0 * std::sqrt(part);
-    if (!(chi_square > n * cube * cube * cube)) return false;
-    unexplained_variance_ = std::max(unexplained_variance_, unexplained / std::max(lever, 1e-12));
+    if (!(chi_square > limit)) return false;
+    const double as_mass = unexplained / std::max(lever, 1e-12) * n / std::max(n - loads_, 1);
+    unexplained_variance_ = std::max(unexplained_variance_, std::min(as_mass, mass_prior_std_ * mass_prior_std_));
     like_mass /= std::max(lever, 1e-12);
     const double rest = unexplained - like_mass * like_mass * lever;
     const double missing = like_mass * like_mass - filter_.parameter_variance(0);
@@ -544,6 +553,7 @@ class PayloadFilter {
   std::array<Window, 2> windows_{{{0.3}, {3.0}}};
   /*DBG*/ JointVector rho_{}, V_{}; std::array<double,4> debug_{};
   double quiet_ = 0.0;
+  bool changed_ = false;
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
   static constexpr double lag = 0.1;          // errors of linearisation last about so long [s]

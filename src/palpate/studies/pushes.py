@@ -18,7 +18,7 @@ from ..logs import Log
 from ..pipeline import Pipeline
 from ..simulate import Attach, Push, Schedule, SensorModel, StopPushing
 from ..weigh.scenes import NOISE_COUNTS
-from ..weigh.session import Route, RouteControl, brick
+from ..weigh.session import Route, RouteControl
 from . import Progress, Row, _figures
 from ._bench import DEFAULT, INTERVAL, MASS_ONLY, Work
 from ._rows import at_most, told
@@ -129,15 +129,13 @@ def simulate(job: Job) -> tuple[Pushed, Arm, Log]:
     angle = math.degrees(math.acos(min(abs(down), 1.0)))
     pushed = Pushed(job.arm, mass, moving, begin, end, force, angle, link + 1, grasp)
 
-    load = brick(mass)
-    assert load is not None
     task = weigh.Task(
         scene=scene, start=start, poses=poses, loads=((0.0, mass),), duration=end + AFTER, hold=1.0, move=2.0
     )
     route = Route(task)
     control = RouteControl(task, route)
     events = [
-        Attach(0.0, load),
+        Attach(0.0, mass),
         Push(begin, "grasp" if grasp else link, force * direction, point=point),
         StopPushing(end),
     ]
