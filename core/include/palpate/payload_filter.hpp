@@ -175,12 +175,15 @@ class PayloadFilter {
     std::int64_t since;                     ///< [ns]
   };
 
-  /// What was left unexplained over the last `memory` seconds.
+  /// Averages over the last `memory` seconds, exponentially weighted once they are past.
   struct Window {
-    double memory;                                            ///< [s]
-    double span = 0.0, start_weight = 1.0;                    ///< so far [s]; of the first sample
-    JointVector torque{}, white{}, rho{}, start_q{}, start_dq{};
-    std::array<std::array<double, 4>, max_joints> lever{};
+    double memory;                                               ///< [s]
+    double span = 0.0, first = 1.0;                              ///< so far [s]; weight of the first sample
+    JointVector torque{};                                        ///< lacking - D theta^ + b^ [N m]
+    std::array<std::array<double, 4>, max_joints> lever{};       ///< D
+    JointVector rho{}, white{}, q_variance{}, dq_variance{};     ///< the latter two when it began
+    JointMatrix V{};                                             ///< of rho, the lower triangle [N^2 m^2]
+    double hidden = 0.0;                                         ///< part of V's diagonal that the learnt model error makes
   };
 
   void begin(const JointSample& s) noexcept {
@@ -194,7 +197,9 @@ class PayloadFilter {
   void forget_everything() noexcept {
     surprise_.fill(1.0);
     recent_surprise_.fill(1.0);
-    unexplained_variance_ = hidden_variance_ = unexplained_time_ = 0.0;
+    hidden_variance_ = unexplained_time_ = 0.0;
+    doubt_.fill(0.0);
+    unlike_ = false;
     mass_before_ = known_time_ = 0.0;
     mass_prior_std_ = initial_prior_std_;
     model_error_.fill(least_model_error);
@@ -295,7 +300,7 @@ class PayloadFilter {
   void learn_model_error(double dt) noexcept {
     for (int i = 0; i < arm_->n(); ++i) {
       double& variance = model_error_[u(i)];
-      const double lacks = std::max(std::abs(windows_[0].rho[u(i)]), std::abs(lacking_now_[u(i)]));
+      const double lacks = std::max(std::abs(now_.rho[u(i)]), std::abs(lacking_[u(i)]));
       const double shown = 4.0 * lacks * lacks, excess = std::min(surprise_[u(i)], recent_surprise_[u(i)]) - 1.3;
       if (variance > shown) variance = std::max(shown, variance * std::exp(-dt / memory));
       else if (excess > 0.0) variance = std::min(shown, variance * std::exp(std::min(std::min(excess, 3.0) / 0.02 * dt, 2.0)));
@@ -306,105 +311,121 @@ class PayloadFilter {
 
   void restart(Window& w) noexcept {
     w.span = 0.0;
-    w.start_weight = 1.0;
+    w.first = 1.0;
     w.torque = w.white = w.rho = {};
     w.lever = {};
     for (int i = 0; i < arm_->n(); ++i) {
-      w.start_q[u(i)] = filter_.variance(i);
-      w.start_dq[u(i)] = filter_.variance(arm_->n() + i);
+      w.q_variance[u(i)] = filter_.variance(i);
+      w.dq_variance[u(i)] = filter_.variance(arm_->n() + i);
     }
   }
   void restart_windows() noexcept {
-    for (Window& w : windows_) restart(w);
+    restart(now_);
+    restart(lately_);
   }
-  /// A push is no mass: its torques stand to each other as no load's do. What the state lacks to follow the positions, the
-  /// torque that its corrections amount to, is what the arm alone leaves unexplained, less the load's D theta and the
-  /// friction's b. Over the last 0.3 s, and 3 s,
-  ///   r = mean(torque - D theta^ + b^),  rho = r + mean(D) theta^ ~ N(0, V)
-  ///   V = noise / N + 2 var(M q')/span^2 + var(b) + D var(theta) D^T
-  /// if it is a load and nothing else. Where rho^T V^-1 rho says otherwise, any part of what looks like a mass may be none:
-  /// it counts as rho^2/D^2, the mass that would be as large.
+  /// A push is no load: its torques stand to each other as no load's do. What the state lacks to follow the positions, as a
+  /// torque (JointKalman::torque_of), is averaged over the last 0.3 s, and over 3 s as long as it stays the same:
+  ///   rho = mean(lacking - D theta^ + b^) + mean(D) theta^ ~ N(0, V),   D the torque per unit of theta, theta^ the estimate,
+  ///   V = noise/N + (var(M q') + var(B q))(begin, end)/span^2 + var(b) + mean(D) P mean(D)^T
+  /// where a load is all there is. If rho^T V^-1 rho is beyond its `evident` quantile, any part of what looks like a load may
+  /// be none: a parameter is then not known better than rho^2/D^2, the change that would take as much torque, times
+  /// n/(n - parameters), for so much of a torque the fit has taken on itself. When it is over, what was learnt meanwhile is as
+  /// doubtful, and is learnt anew.
   void look_for_unexplained(const JointVector& lacking, double dt) noexcept {
     const int n = arm_->n();
-    for (int i = 0; i < n; ++i)  // the velocities were still unknown, and what was corrected was nobody's torque
-      if (filter_.variance(n + i) < 0.25 * windows_[0].start_dq[u(i)] && windows_[0].span < windows_[0].memory) {
+    for (int i = 0; i < n; ++i)  // while the velocities become known, corrections are nobody's torque
+      if (now_.span < now_.memory && filter_.variance(n + i) < 0.25 * now_.dq_variance[u(i)]) {
         restart_windows();
         break;
       }
-    quiet_ += dt;
-    unexplained_variance_ *= std::exp(-dt / 0.1);
-    const bool now = average(windows_[0], lacking, dt), lasting = average(windows_[1], lacking, dt);
-    if (now || lasting) quiet_ = 0.0;
-    if (now || changed_) restart(windows_[1]);
-    if (quiet_ > windows_[0].memory) unexplained_variance_ = 0.0;
+    for (double& doubt : doubt_) doubt *= std::exp(-dt / 0.1);
+    average(lately_, lacking, dt);
+    const Cholesky<double> V(average(now_, lacking, dt), n);
+    hidden_variance_ = now_.hidden / std::max(squared_lever(now_, 0), 1e-12);
+    bool unlike = false;
+    if (now_.span >= least_span) {
+      JointVector change{};
+      for (int i = 0; i < n; ++i) change[u(i)] = lately_.rho[u(i)] - now_.rho[u(i)];
+      unlike = evident(V, now_.rho);
+      if (unlike) doubt(now_);
+      if (unlike || evident(V, change)) restart(lately_);
+    }
+    if (lately_.span >= least_span && evident(Cholesky<double>(lately_.V, n), lately_.rho)) {
+      doubt(lately_);
+      unlike = true;
+    }
+    if (unlike_ && !unlike)
+      for (int k = 0; k < loads_; ++k) filter_.add_parameter_variance(k, doubt_[u(k)]);
+    unlike_ = unlike;
     const double quick = -std::expm1(-dt / 0.03);
-    for (int i = 0; i < n; ++i) lacking_now_[u(i)] += quick * (lacking[u(i)] - lacking_now_[u(i)]);
+    for (int i = 0; i < n; ++i) lacking_[u(i)] += quick * (lacking[u(i)] - lacking_[u(i)]);
   }
-  /// Takes in a sample; whether what a window has seen is no load.
-  bool average(Window& w, const JointVector& lacking, double dt) noexcept {
+  /// Takes in a sample, and returns V.
+  const JointMatrix& average(Window& w, const JointVector& lacking, double dt) noexcept {
     const int n = arm_->n();
     w.span = std::min(w.span + dt, w.memory);
     const double a = std::min(dt / w.span, 1.0);
-    w.start_weight = w.span < w.memory ? a : w.start_weight * (1.0 - a);
-    JointMatrix V{};
-    double unexplained = 0.0, hidden = 0.0, lever = 0.0, like_mass = 0.0;
-    std::array<std::array<double, 4>, max_joints> DP;
+    w.first = w.span < w.memory ? a : w.first * (1.0 - a);  // weight of the first sample
+    w.hidden = 0.0;
     for (int i = 0; i < n; ++i) {
       const auto& D = lever_[u(i)];
       auto& mean = w.lever[u(i)];
-      double torque = lacking[u(i)] + (biases_ > 0 ? filter_.parameter(loads_ + i) : 0.0);
-      double& rho = w.rho[u(i)];
-      rho = 0.0;
+      double torque = lacking[u(i)] + (biases_ > 0 ? filter_.parameter(loads_ + i) : 0.0), expected = 0.0;
       for (int k = 0; k < loads_; ++k) {
         torque -= D[u(k)] * filter_.parameter(k);
         mean[u(k)] += a * (D[u(k)] - mean[u(k)]);
-        rho += mean[u(k)] * filter_.parameter(k);
-      }
-      for (int k = 0; k < loads_; ++k) {
-        DP[u(i)][u(k)] = 0.0;
-        for (int l = 0; l < loads_; ++l) DP[u(i)][u(k)] += mean[u(l)] * filter_.covariance(2 * n + l, 2 * n + k);
+        expected += mean[u(k)] * filter_.parameter(k);
       }
       w.torque[u(i)] += a * (torque - w.torque[u(i)]);
-      rho += w.torque[u(i)];
+      w.rho[u(i)] = w.torque[u(i)] + expected;
       w.white[u(i)] = (1.0 - a) * (1.0 - a) * w.white[u(i)] + a * a * noise_[u(i)];
-      const double M = filter_.inertia()[u(i)], B = filter_.damping()[u(i)];
-      const double now = M * M * filter_.variance(n + i) + B * B * filter_.variance(i);
-      const double start = M * M * w.start_dq[u(i)] + B * B * w.start_q[u(i)];
-      V(i, i) = w.white[u(i)] + now / (w.span * w.span) + start * w.start_weight * w.start_weight / (dt * dt);
+      const double M = filter_.inertia()[u(i)], B = filter_.damping()[u(i)], first = w.first / dt;
+      const double end = M * M * filter_.variance(n + i) + B * B * filter_.variance(i);
+      const double begin = M * M * w.dq_variance[u(i)] + B * B * w.q_variance[u(i)];
+      const double variance = w.white[u(i)] + end / (w.span * w.span) + begin * first * first;
       const double learnt = model_error_[u(i)] - least_model_error;
-      hidden += V(i, i) * learnt / (learnt + noise_[u(i)] + 1e-12);
-      if (biases_ > 0) V(i, i) += bias_variance(i);
-      for (int j = 0; j <= i; ++j)
-        for (int k = 0; k < loads_; ++k) V(i, j) += DP[u(i)][u(k)] * w.lever[u(j)][u(k)];
-      unexplained += rho * rho;
-      lever += mean[0] * mean[0];
-      like_mass -= mean[0] * rho;
+      w.hidden += variance * learnt / (learnt + noise_[u(i)] + 1e-12);
+      std::array<double, 4> DP{};
+      for (int k = 0; k < loads_; ++k)
+        for (int l = 0; l < loads_; ++l) DP[u(k)] += mean[u(l)] * filter_.covariance(2 * n + l, 2 * n + k);
+      for (int j = 0; j <= i; ++j) {
+        w.V(i, j) = 0.0;
+        for (int k = 0; k < loads_; ++k) w.V(i, j) += DP[u(k)] * w.lever[u(j)][u(k)];
+      }
+      w.V(i, i) += variance + (biases_ > 0 ? bias_variance(i) : 0.0);
     }
-    if (&w == &windows_[0]) hidden_variance_ = hidden / std::max(lever, 1e-12);
-    if (w.span < 0.1) return false;
-    const Cholesky<double> factor(V, n);
-    const auto chi_square_of = [&](const JointVector& x) {
-      const JointVector y = factor.solve(x);
-      double sum = 0.0;
-      for (int i = 0; i < n; ++i) sum += x[u(i)] * y[u(i)];
-      return sum;
-    };
-    const double part = 2.0 / (9.0 * n), cube = 1.0 - part + 4.0 * std::sqrt(part), limit = n * cube * cube * cube;
-    const double chi_square = chi_square_of(w.rho);
-    if (&w == &windows_[0]) {
-      JointVector change{};
-      for (int i = 0; i < n; ++i) change[u(i)] = windows_[1].rho[u(i)] - w.rho[u(i)];
-      changed_ = chi_square_of(change) > limit;
+    return w.V;
+  }
+  /// Whether x^T V^-1 x is more than chance: chi-square's quantile of 4 standard deviations, after Wilson and Hilferty.
+  bool evident(const Cholesky<double>& V, const JointVector& x) const noexcept {
+    const int n = arm_->n();
+    const double part = 2.0 / (9.0 * n), root = 1.0 - part + 4.0 * std::sqrt(part);
+    const JointVector y = V.solve(x);
+    double chi_square = 0.0;
+    for (int i = 0; i < n; ++i) chi_square += x[u(i)] * y[u(i)];
+    return chi_square > n * root * root * root;
+  }
+  double squared_lever(const Window& w, int k) const noexcept {
+    double sum = 0.0;
+    for (int i = 0; i < arm_->n(); ++i) sum += w.lever[u(i)][u(k)] * w.lever[u(i)][u(k)];
+    return sum;
+  }
+  void doubt(const Window& w) noexcept {
+    const int n = arm_->n();
+    double squares = 0.0, as_mass = 0.0;
+    for (int i = 0; i < n; ++i) {
+      squares += w.rho[u(i)] * w.rho[u(i)];
+      as_mass -= w.lever[u(i)][0] * w.rho[u(i)];
     }
-    /*DBG*/ if (&w == &windows_[0]) { debug_[0] = chi_square; rho_ = w.rho; for (int i = 0; i < n; ++i) V_[u(i)] = V(i, i); } else debug_[1] = chi_square;
-    if (!(chi_square > limit)) return false;
-    const double as_mass = unexplained / std::max(lever, 1e-12) * n / std::max(n - loads_, 1);
-    unexplained_variance_ = std::max(unexplained_variance_, std::min(as_mass, mass_prior_std_ * mass_prior_std_));
-    like_mass /= std::max(lever, 1e-12);
-    const double rest = unexplained - like_mass * like_mass * lever;
-    const double missing = like_mass * like_mass - filter_.parameter_variance(0);
-    if (like_mass * like_mass * lever * (n - 1) > 4.0 * rest && missing > 0.0) filter_.add_parameter_variance(0, missing);
-    return true;
+    const double taken = static_cast<double>(n) / std::max(n - loads_, 1);
+    for (int k = 0; k < loads_; ++k) {
+      const double prior = k == 0 ? mass_prior_std_ : config_.offset_prior_std * bounding_mass_;
+      doubt_[u(k)] = std::max(doubt_[u(k)], std::min(taken * squares / std::max(squared_lever(w, k), 1e-12), prior * prior));
+    }
+    // What is a mass but for a rest that is small beside it, and was overlooked for the filter thought it knew better: learnt.
+    const double lever = std::max(squared_lever(w, 0), 1e-12), mass_square = as_mass * as_mass / (lever * lever);
+    const double missing = mass_square - filter_.parameter_variance(0);
+    if (missing > 0.0 && mass_square * lever * (n - 1) > 4.0 * (squares - mass_square * lever)) filter_.add_parameter_variance(0, missing);
   }
 
   /// Whether the state explains what every joint does now.
@@ -524,17 +545,17 @@ class PayloadFilter {
   Payload report(const JointSample&, Status status) const noexcept {
     Payload out;
     out.mass = filter_.parameter(0);
-    out.mass_std = std::hypot(mass_std(), std::sqrt(unexplained_variance_ + hidden_variance_), out.mass - mass_before_);
+    out.mass_std = std::hypot(mass_std(), std::sqrt(doubt_[0] + hidden_variance_), out.mass - mass_before_);
     for (int k = 1; k < loads_; ++k) {
       out.first_moment[u(k - 1)] = filter_.parameter(k);
-      out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0));
+      out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0) + doubt_[u(k)]);
     }
     out.changes = changes_;
     out.change_time_ns = change_time_ns_;
     out.status = status;
     const bool sure = out.mass_std <= std::max(config_.ok_relative * std::abs(out.mass), config_.ok_absolute);
     const bool possible = out.mass >= -std::max(3.0 * out.mass_std, config_.ok_absolute);
-    if (status == Status::ok && !(sure && possible && explained() && windows_[0].span >= 0.1)) out.status = Status::warming;
+    if (status == Status::ok && !(sure && possible && explained() && now_.span >= least_span)) out.status = Status::warming;
     return out;
   }
 
@@ -549,11 +570,12 @@ class PayloadFilter {
   JointVector tau_{}, torque_variance_{}, surprise_{}, recent_surprise_{}, model_error_{};
   JointVector noise_{};                               // of the torque without the model error, per step [N^2 m^2]
   std::array<std::array<double, 4>, max_joints> lever_{};  // torque per parameter of the load
-  JointVector lacking_now_{};
-  std::array<Window, 2> windows_{{{0.3}, {3.0}}};
-  /*DBG*/ JointVector rho_{}, V_{}; std::array<double,4> debug_{};
-  double quiet_ = 0.0;
-  bool changed_ = false;
+  JointVector lacking_{};                             // over 0.03 s [N m]
+  Window now_{.memory = memory}, lately_{.memory = 10.0 * memory};
+  static constexpr double least_span = 0.1;           // before which a window tells nothing [s]
+  std::array<double, 4> doubt_{};                     // variances of the load's parameters while something else is felt
+  double hidden_variance_ = 0.0;                      // of the mass, by torques that the learnt model error would hide [kg^2]
+  bool unlike_ = false;                               // something else than a load is felt
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
   static constexpr double lag = 0.1;          // errors of linearisation last about so long [s]
@@ -564,8 +586,6 @@ class PayloadFilter {
   std::uint32_t changes_ = 0;
   std::int64_t change_time_ns_ = 0, change_seen_ns_ = 0;
   double last_jump_ = 0.0;  // [kg]
-  double hidden_variance_ = 0.0;
-  double unexplained_variance_ = 0.0;  // of the mass, by what the model gets wrong [kg^2]
   double unexplained_time_ = 0.0;      // [s]
   double mass_before_ = 0.0;           // the estimate about `lag` ago [kg]
   double known_time_ = 0.0;            // `ok` without a break since the load was forgotten, up to known_after [s]

@@ -39,6 +39,8 @@ BACK = 3.0
 """after a push it should be right again by then [s]"""
 LEAST_LEVER = 0.06
 """of the load about the joint that feels it most [m]"""
+HELD = 0.5
+"""so long without a break it is then right [s]"""
 WRONG = 3.0
 """a number is wrong that errs by more standard deviations than this"""
 BANDS = (0.0, 10.0, 30.0, 60.0, 90.0)
@@ -93,15 +95,13 @@ class Seen(NamedTuple):
 
     @property
     def back(self) -> float:
-        """After the end of the push, until the mass is ok and within 3 standard deviations for good [s]."""
-        bad = ~self.ok | (np.abs(self.error) > WRONG * self.std)
-        after = np.flatnonzero(self.time >= self.pushed.end)
-        last = np.flatnonzero(bad[after])
-        if not last.size:
-            return 0.0
-        if last[-1] + 1 == after.size:
-            return math.inf
-        return float(self.time[after[last[-1] + 1]]) - self.pushed.end
+        """From the end of the push until the mass is ok and within 3 standard deviations, for HELD seconds [s]."""
+        good = self.ok & (np.abs(self.error) <= WRONG * self.std)
+        step = float(self.time[1] - self.time[0])
+        held = round(HELD / step)
+        after = np.convolve(good[self.time >= self.pushed.end], np.ones(held), "valid")
+        right = np.flatnonzero(after > held - 0.5)
+        return float(right[0]) * step if right.size else math.inf
 
 
 def simulate(job: Job) -> tuple[Pushed, Arm, Log]:
