@@ -182,7 +182,6 @@ class PayloadFilter {
     JointVector torque{};                                        ///< lacking - D theta^ + b^ [N m]
     std::array<std::array<double, 4>, max_joints> lever{};       ///< D
     JointVector rho{}, white{}, q_variance{}, dq_variance{};     ///< the latter two when it began
-    JointMatrix V{};                                             ///< of rho, the lower triangle [N^2 m^2]
     double hidden = 0.0;                                         ///< part of V's diagonal that the learnt model error makes
   };
 
@@ -199,7 +198,7 @@ class PayloadFilter {
     recent_surprise_.fill(1.0);
     hidden_variance_ = unexplained_time_ = 0.0;
     doubt_.fill(0.0);
-    unlike_ = false;
+    unlike_ = unlike_lately_ = false;
     mass_before_ = known_time_ = 0.0;
     mass_prior_std_ = initial_prior_std_;
     model_error_.fill(least_model_error);
@@ -339,35 +338,36 @@ class PayloadFilter {
         break;
       }
     for (double& doubt : doubt_) doubt *= std::exp(-dt / 0.1);
+    average(now_, lacking, dt);
     average(lately_, lacking, dt);
-    const Cholesky<double> V(average(now_, lacking, dt), n);
+    const Cholesky<double> V(covariance(now_, dt), n);
     hidden_variance_ = now_.hidden / std::max(squared_lever(now_, 0), 1e-12);
-    bool unlike = false;
-    if (now_.span >= least_span) {
+    bool unlike = now_.span >= least_span && evident(V, now_.rho);
+    if (unlike) {
+      doubt(now_);
+      restart(lately_);
+    }
+    since_test_ += dt;
+    if (since_test_ >= 0.02) {
+      since_test_ = 0.0;
       JointVector change{};
       for (int i = 0; i < n; ++i) change[u(i)] = lately_.rho[u(i)] - now_.rho[u(i)];
-      unlike = evident(V, now_.rho);
-      if (unlike) doubt(now_);
-      if (unlike || evident(V, change)) restart(lately_);
+      if (now_.span >= least_span && evident(V, change)) restart(lately_);
+      unlike_lately_ = lately_.span >= least_span && evident(Cholesky<double>(covariance(lately_, dt), n), lately_.rho);
+      if (unlike_lately_) doubt(lately_);
     }
-    if (lately_.span >= least_span && evident(Cholesky<double>(lately_.V, n), lately_.rho)) {
-      doubt(lately_);
-      unlike = true;
-    }
+    unlike = unlike || unlike_lately_;
     if (unlike_ && !unlike)
       for (int k = 0; k < loads_; ++k) filter_.add_parameter_variance(k, doubt_[u(k)]);
     unlike_ = unlike;
     const double quick = -std::expm1(-dt / 0.03);
     for (int i = 0; i < n; ++i) lacking_[u(i)] += quick * (lacking[u(i)] - lacking_[u(i)]);
   }
-  /// Takes in a sample, and returns V.
-  const JointMatrix& average(Window& w, const JointVector& lacking, double dt) noexcept {
-    const int n = arm_->n();
+  void average(Window& w, const JointVector& lacking, double dt) noexcept {
     w.span = std::min(w.span + dt, w.memory);
     const double a = std::min(dt / w.span, 1.0);
-    w.first = w.span < w.memory ? a : w.first * (1.0 - a);  // weight of the first sample
-    w.hidden = 0.0;
-    for (int i = 0; i < n; ++i) {
+    w.first = w.span < w.memory ? a : w.first * (1.0 - a);
+    for (int i = 0; i < arm_->n(); ++i) {
       const auto& D = lever_[u(i)];
       auto& mean = w.lever[u(i)];
       double torque = lacking[u(i)] + (biases_ > 0 ? filter_.parameter(loads_ + i) : 0.0), expected = 0.0;
@@ -379,6 +379,14 @@ class PayloadFilter {
       w.torque[u(i)] += a * (torque - w.torque[u(i)]);
       w.rho[u(i)] = w.torque[u(i)] + expected;
       w.white[u(i)] = (1.0 - a) * (1.0 - a) * w.white[u(i)] + a * a * noise_[u(i)];
+    }
+  }
+  /// V, the lower triangle.
+  JointMatrix covariance(Window& w, double dt) const noexcept {
+    const int n = arm_->n();
+    JointMatrix V{};
+    w.hidden = 0.0;
+    for (int i = 0; i < n; ++i) {
       const double M = filter_.inertia()[u(i)], B = filter_.damping()[u(i)], first = w.first / dt;
       const double end = M * M * filter_.variance(n + i) + B * B * filter_.variance(i);
       const double begin = M * M * w.dq_variance[u(i)] + B * B * w.q_variance[u(i)];
@@ -387,14 +395,12 @@ class PayloadFilter {
       w.hidden += variance * learnt / (learnt + noise_[u(i)] + 1e-12);
       std::array<double, 4> DP{};
       for (int k = 0; k < loads_; ++k)
-        for (int l = 0; l < loads_; ++l) DP[u(k)] += mean[u(l)] * filter_.covariance(2 * n + l, 2 * n + k);
-      for (int j = 0; j <= i; ++j) {
-        w.V(i, j) = 0.0;
-        for (int k = 0; k < loads_; ++k) w.V(i, j) += DP[u(k)] * w.lever[u(j)][u(k)];
-      }
-      w.V(i, i) += variance + (biases_ > 0 ? bias_variance(i) : 0.0);
+        for (int l = 0; l < loads_; ++l) DP[u(k)] += w.lever[u(i)][u(l)] * filter_.covariance(2 * n + l, 2 * n + k);
+      for (int j = 0; j <= i; ++j)
+        for (int k = 0; k < loads_; ++k) V(i, j) += DP[u(k)] * w.lever[u(j)][u(k)];
+      V(i, i) += variance + (biases_ > 0 ? bias_variance(i) : 0.0);
     }
-    return w.V;
+    return V;
   }
   /// Whether x^T V^-1 x is more than chance: chi-square's quantile of 4 standard deviations, after Wilson and Hilferty.
   bool evident(const Cholesky<double>& V, const JointVector& x) const noexcept {
@@ -575,7 +581,8 @@ class PayloadFilter {
   static constexpr double least_span = 0.1;           // before which a window tells nothing [s]
   std::array<double, 4> doubt_{};                     // variances of the load's parameters while something else is felt
   double hidden_variance_ = 0.0;                      // of the mass, by torques that the learnt model error would hide [kg^2]
-  bool unlike_ = false;                               // something else than a load is felt
+  double since_test_ = 0.0;                           // of what was felt lately [s]
+  bool unlike_ = false, unlike_lately_ = false;       // something else than a load is felt
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
   static constexpr double lag = 0.1;          // errors of linearisation last about so long [s]
