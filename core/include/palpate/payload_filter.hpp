@@ -191,7 +191,7 @@ class PayloadFilter {
     for (int i = 0; i < biases_; ++i) redraw_bias(i);
     started_ = true;
     restart_hypotheses();
-    restart_windows();
+    unsettled_ = memory;
   }
   void forget_everything() noexcept {
     surprise_.fill(1.0);
@@ -301,7 +301,7 @@ class PayloadFilter {
       double& variance = model_error_[u(i)];
       const double lacks = std::max(std::abs(now_.rho[u(i)]), std::abs(lacking_[u(i)]));
       const double shown = 4.0 * lacks * lacks, excess = std::min(surprise_[u(i)], recent_surprise_[u(i)]) - 1.3;
-      if (variance > shown) variance = std::max(shown, variance * std::exp(-dt / memory));
+      if (variance > shown) variance = std::max(shown, variance * std::exp(-2.0 * dt / memory));
       else if (excess > 0.0) variance = std::min(shown, variance * std::exp(std::min(std::min(excess, 3.0) / 0.02 * dt, 2.0)));
       else variance *= std::exp(dt * std::max(surprise_[u(i)] - 1.3, -1.0));
       variance = std::clamp(variance, least_model_error, 1e6);
@@ -318,10 +318,6 @@ class PayloadFilter {
       w.dq_variance[u(i)] = filter_.variance(arm_->n() + i);
     }
   }
-  void restart_windows() noexcept {
-    restart(now_);
-    restart(lately_);
-  }
   /// A push is no load: its torques stand to each other as no load's do. What the state lacks to follow the positions, as a
   /// torque (JointKalman::torque_of), is averaged over the last 0.3 s, and over 3 s as long as it stays the same:
   ///   rho = mean(lacking - D theta^ + b^) + mean(D) theta^ ~ N(0, V),   D the torque per unit of theta, theta^ the estimate,
@@ -332,11 +328,11 @@ class PayloadFilter {
   /// doubtful, and is learnt anew.
   void look_for_unexplained(const JointVector& lacking, double dt) noexcept {
     const int n = arm_->n();
-    for (int i = 0; i < n; ++i)  // while the velocities become known, corrections are nobody's torque
-      if (now_.span < now_.memory && filter_.variance(n + i) < 0.25 * now_.dq_variance[u(i)]) {
-        restart_windows();
-        break;
-      }
+    unsettled_ -= dt;
+    if (unsettled_ > 0.0) {  // corrections are still those of the guess it began with
+      restart(now_);
+      restart(lately_);
+    }
     for (double& doubt : doubt_) doubt *= std::exp(-dt / 0.1);
     average(now_, lacking, dt);
     average(lately_, lacking, dt);
@@ -539,7 +535,7 @@ class PayloadFilter {
       if (!correction) set_offset_prior();
       mass_before_ = filter_.parameter(0);
       restart_hypotheses();
-      restart_windows();
+      unsettled_ = memory;
       return;
     }
     for (Hypothesis& hyp : hypotheses_)
@@ -581,6 +577,7 @@ class PayloadFilter {
   static constexpr double least_span = 0.1;           // before which a window tells nothing [s]
   std::array<double, 4> doubt_{};                     // variances of the load's parameters while something else is felt
   double hidden_variance_ = 0.0;                      // of the mass, by torques that the learnt model error would hide [kg^2]
+  double unsettled_ = 0.0;                            // for so long what is lacking tells nothing [s]
   double since_test_ = 0.0;                           // of what was felt lately [s]
   bool unlike_ = false, unlike_lately_ = false;       // something else than a load is felt
   Filter::Parameters decay_{};
