@@ -198,7 +198,8 @@ class PayloadFilter {
     recent_surprise_.fill(1.0);
     hidden_variance_ = unexplained_time_ = 0.0;
     doubt_.fill(0.0);
-    unlike_ = unlike_lately_ = false;
+    unlike_ = false;
+    lately_evidence_ = 0.0;
     mass_before_ = known_time_ = 0.0;
     mass_prior_std_ = initial_prior_std_;
     model_error_.fill(least_model_error);
@@ -322,7 +323,7 @@ class PayloadFilter {
   /// torque (JointKalman::torque_of), is averaged over the last 0.3 s, and over 3 s as long as it stays the same:
   ///   rho = mean(lacking - D theta^ + b^) + mean(D) theta^ ~ N(0, V),   D the torque per unit of theta, theta^ the estimate,
   ///   V = noise/N + (var(M q') + var(B q))(begin, end)/span^2 + var(b) + mean(D) P mean(D)^T
-  /// where a load is all there is. If rho^T V^-1 rho is beyond its `evident` quantile, any part of what looks like a load may
+  /// where a load is all there is. If rho^T V^-1 rho says otherwise, any part of what looks like a load may
   /// be none: a parameter is then not known better than rho^2/D^2, the change that would take as much torque, times
   /// n/(n - parameters), for so much of a torque the fit has taken on itself. When it is over, what was learnt meanwhile is as
   /// doubtful, and is learnt anew.
@@ -338,9 +339,9 @@ class PayloadFilter {
     average(lately_, lacking, dt);
     const Cholesky<double> V(covariance(now_, dt), n);
     hidden_variance_ = now_.hidden / std::max(squared_lever(now_, 0), 1e-12);
-    bool unlike = now_.span >= least_span && evident(V, now_.rho);
-    if (unlike) {
-      doubt(now_);
+    double evidence = now_.span < least_span ? 0.0 : deviations(V, now_.rho);
+    if (evidence > doubtful) {
+      doubt(now_, evidence);
       restart(lately_);
     }
     since_test_ += dt;
@@ -348,14 +349,16 @@ class PayloadFilter {
       since_test_ = 0.0;
       JointVector change{};
       for (int i = 0; i < n; ++i) change[u(i)] = lately_.rho[u(i)] - now_.rho[u(i)];
-      if (now_.span >= least_span && evident(V, change)) restart(lately_);
-      unlike_lately_ = lately_.span >= least_span && evident(Cholesky<double>(covariance(lately_, dt), n), lately_.rho);
-      if (unlike_lately_) doubt(lately_);
+      if (now_.span >= least_span && deviations(V, change) > doubtful) restart(lately_);
+      lately_evidence_ = lately_.span < least_span ? 0.0 : deviations(Cholesky<double>(covariance(lately_, dt), n), lately_.rho);
+      if (lately_evidence_ > doubtful) doubt(lately_, lately_evidence_);
     }
-    unlike = unlike || unlike_lately_;
-    if (unlike_ && !unlike)
+    evidence = std::max(evidence, lately_evidence_);
+    if (unlike_ && evidence < doubtful) {
       for (int k = 0; k < loads_; ++k) filter_.add_parameter_variance(k, doubt_[u(k)]);
-    unlike_ = unlike;
+      unlike_ = false;
+    }
+    unlike_ = unlike_ || evidence > certain;
     const double quick = -std::expm1(-dt / 0.03);
     for (int i = 0; i < n; ++i) lacking_[u(i)] += quick * (lacking[u(i)] - lacking_[u(i)]);
   }
@@ -398,21 +401,20 @@ class PayloadFilter {
     }
     return V;
   }
-  /// Whether x^T V^-1 x is more than chance: chi-square's quantile of 4 standard deviations, after Wilson and Hilferty.
-  bool evident(const Cholesky<double>& V, const JointVector& x) const noexcept {
-    const int n = arm_->n();
-    const double part = 2.0 / (9.0 * n), root = 1.0 - part + 4.0 * std::sqrt(part);
+  /// x^T V^-1 x in standard deviations of the normal distribution that has as rare values (Wilson, Hilferty 1931).
+  double deviations(const Cholesky<double>& V, const JointVector& x) const noexcept {
     const JointVector y = V.solve(x);
     double chi_square = 0.0;
-    for (int i = 0; i < n; ++i) chi_square += x[u(i)] * y[u(i)];
-    return chi_square > n * root * root * root;
+    for (int i = 0; i < arm_->n(); ++i) chi_square += x[u(i)] * y[u(i)];
+    const double part = 2.0 / (9.0 * arm_->n());
+    return (std::cbrt(chi_square / arm_->n()) - 1.0 + part) / std::sqrt(part);
   }
   double squared_lever(const Window& w, int k) const noexcept {
     double sum = 0.0;
     for (int i = 0; i < arm_->n(); ++i) sum += w.lever[u(i)][u(k)] * w.lever[u(i)][u(k)];
     return sum;
   }
-  void doubt(const Window& w) noexcept {
+  void doubt(const Window& w, double evidence) noexcept {
     const int n = arm_->n();
     double squares = 0.0, as_mass = 0.0;
     for (int i = 0; i < n; ++i) {
@@ -427,7 +429,7 @@ class PayloadFilter {
     // What is a mass but for a rest that is small beside it, and was overlooked for the filter thought it knew better: learnt.
     const double lever = std::max(squared_lever(w, 0), 1e-12), mass_square = as_mass * as_mass / (lever * lever);
     const double missing = mass_square - filter_.parameter_variance(0);
-    if (missing > 0.0 && mass_square * lever * (n - 1) > 4.0 * (squares - mass_square * lever)) filter_.add_parameter_variance(0, missing);
+    if (evidence > certain && missing > 0.0 && mass_square * lever * (n - 1) > 4.0 * (squares - mass_square * lever)) filter_.add_parameter_variance(0, missing);
   }
 
   /// Whether the state explains what every joint does now.
@@ -579,7 +581,9 @@ class PayloadFilter {
   double hidden_variance_ = 0.0;                      // of the mass, by torques that the learnt model error would hide [kg^2]
   double unsettled_ = 0.0;                            // for so long what is lacking tells nothing [s]
   double since_test_ = 0.0;                           // of what was felt lately [s]
-  bool unlike_ = false, unlike_lately_ = false;       // something else than a load is felt
+  static constexpr double doubtful = 4.0, certain = 5.0;  // standard deviations that make a torque no load's
+  double lately_evidence_ = 0.0;                      // such, at the last test
+  bool unlike_ = false;                               // something else than a load has certainly been felt
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
   static constexpr double lag = 0.1;          // errors of linearisation last about so long [s]
