@@ -330,10 +330,8 @@ class PayloadFilter {
   void look_for_unexplained(const JointVector& lacking, double dt) noexcept {
     const int n = arm_->n();
     unsettled_ -= dt;
-    if (unsettled_ > 0.0) {  // corrections are still those of the guess it began with
-      restart(now_);
-      restart(lately_);
-    }
+    if (unsettled_ > 0.0) restart(now_);  // corrections are still those of the guess it began with
+    if (now_.span < now_.memory) restart(lately_);
     for (double& doubt : doubt_) doubt *= std::exp(-dt / 0.1);
     average(now_, lacking, dt);
     average(lately_, lacking, dt);
