@@ -199,7 +199,7 @@ class PayloadFilter {
     hidden_variance_ = unexplained_time_ = 0.0;
     doubt_.fill(0.0);
     unlike_ = false;
-    lately_evidence_ = 0.0;
+    lately_evidence_ = doubtful_time_ = 0.0;
     mass_before_ = known_time_ = 0.0;
     mass_prior_std_ = initial_prior_std_;
     model_error_.fill(least_model_error);
@@ -356,7 +356,8 @@ class PayloadFilter {
       for (int k = 0; k < loads_; ++k) filter_.add_parameter_variance(k, doubt_[u(k)]);
       unlike_ = false;
     }
-    unlike_ = unlike_ || evidence > certain;
+    doubtful_time_ = evidence > doubtful ? doubtful_time_ + dt : 0.0;
+    unlike_ = unlike_ || evidence > certain || doubtful_time_ > 0.1;
     const double quick = -std::expm1(-dt / 0.03);
     for (int i = 0; i < n; ++i) lacking_[u(i)] += quick * (lacking[u(i)] - lacking_[u(i)]);
   }
@@ -581,6 +582,7 @@ class PayloadFilter {
   double since_test_ = 0.0;                           // of what was felt lately [s]
   static constexpr double doubtful = 4.0, certain = 5.0;  // standard deviations that make a torque no load's
   double lately_evidence_ = 0.0;                      // such, at the last test
+  double doubtful_time_ = 0.0;                        // for so long it has been [s]
   bool unlike_ = false;                               // something else than a load has certainly been felt
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
