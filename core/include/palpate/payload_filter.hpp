@@ -191,7 +191,7 @@ class PayloadFilter {
     for (int i = 0; i < biases_; ++i) redraw_bias(i);
     started_ = true;
     restart_hypotheses();
-    unsettled_ = memory;
+    unsettled_ = least_span;
   }
   void forget_everything() noexcept {
     surprise_.fill(1.0);
