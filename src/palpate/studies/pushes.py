@@ -19,7 +19,7 @@ from ..logs import Log
 from ..pipeline import Pipeline
 from ..simulate import Attach, Push, ScenarioEvent, Schedule, SensorModel, StopPushing
 from ..weigh.scenes import NOISE_COUNTS
-from ..weigh.session import Route, RouteControl
+from ..weigh.trial import Route, RouteControl
 from . import Progress, Row, _figures
 from ._bench import DEFAULT, INTERVAL, MASS_ONLY, Work
 from ._rows import at_most, told
