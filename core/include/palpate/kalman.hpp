@@ -61,6 +61,8 @@ class JointKalman {
     }
     return out;
   }
+  /// The mass matrix of the last prediction, with what friction adds in a step [kg m^2].
+  const JointMatrix& mass() const noexcept { return W_; }
   /// Slope of friction over q' in the last prediction [N m s/rad].
   const JointVector& damping() const noexcept { return slope_; }
   JointVector velocities() const noexcept { return slice(n_); }

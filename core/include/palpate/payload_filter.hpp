@@ -181,7 +181,8 @@ class PayloadFilter {
     double span = 0.0, first = 1.0;                              ///< so far [s]; weight of the first sample
     JointVector torque{};                                        ///< lacking - D theta^ + b^ [N m]
     std::array<std::array<double, 4>, max_joints> lever{};       ///< D
-    JointVector rho{}, white{}, q_variance{}, dq_variance{};     ///< the latter two when it began
+    JointVector rho{}, white{}, q_variance{};                    ///< the last when it began
+    JointMatrix dq_covariance{};                                 ///< likewise
     double hidden = 0.0;                                         ///< part of V's diagonal that the learnt model error makes
   };
 
@@ -316,13 +317,13 @@ class PayloadFilter {
     w.lever = {};
     for (int i = 0; i < arm_->n(); ++i) {
       w.q_variance[u(i)] = filter_.variance(i);
-      w.dq_variance[u(i)] = filter_.variance(arm_->n() + i);
+      for (int j = 0; j <= i; ++j) w.dq_covariance(i, j) = w.dq_covariance(j, i) = filter_.covariance(arm_->n() + i, arm_->n() + j);
     }
   }
   /// A push is no load: its torques stand to each other as no load's do. What the state lacks to follow the positions, as a
   /// torque (JointKalman::torque_of), is averaged over the last 0.3 s, and over 3 s as long as it stays the same:
   ///   rho = mean(lacking - D theta^ + b^) + mean(D) theta^ ~ N(0, V),   D the torque per unit of theta, theta^ the estimate,
-  ///   V = noise/N + (var(M q') + var(B q))(begin, end)/span^2 + var(b) + mean(D) P mean(D)^T
+  ///   V = noise/N + (W cov(q') W + var(B q))(begin, end)/span^2 + var(b) + mean(D) P mean(D)^T
   /// where a load is all there is. If rho^T V^-1 rho says otherwise, any part of what looks like a load may
   /// be none: a parameter is then not known better than rho^2/D^2, the change that would take as much torque, times
   /// n/(n - parameters), for so much of a torque the fit has taken on itself. When it is over, what was learnt meanwhile is as
@@ -357,7 +358,7 @@ class PayloadFilter {
       unlike_ = false;
     }
     doubtful_time_ = evidence > doubtful ? doubtful_time_ + dt : 0.0;
-    unlike_ = unlike_ || evidence > certain || doubtful_time_ > 0.1;
+    unlike_ = unlike_ || evidence > certain || doubtful_time_ > lasting;
     const double quick = -std::expm1(-dt / 0.03);
     for (int i = 0; i < n; ++i) lacking_[u(i)] += quick * (lacking[u(i)] - lacking_[u(i)]);
   }
@@ -384,11 +385,20 @@ class PayloadFilter {
     const int n = arm_->n();
     JointMatrix V{};
     w.hidden = 0.0;
+    const double first = w.first / dt;
+    const JointMatrix& W = filter_.mass();
+    JointMatrix WE{};  // W times the covariance of (q'(end) - q'(begin))/span
+    for (int k = 0; k < n; ++k)
+      for (int l = 0; l < n; ++l) {
+        const double E = filter_.covariance(n + std::max(k, l), n + std::min(k, l)) / (w.span * w.span) + w.dq_covariance(k, l) * first * first;
+        for (int i = 0; i < n; ++i) WE(i, l) += W(i, k) * E;
+      }
     for (int i = 0; i < n; ++i) {
-      const double M = filter_.inertia()[u(i)], B = filter_.damping()[u(i)], first = w.first / dt;
-      const double end = M * M * filter_.variance(n + i) + B * B * filter_.variance(i);
-      const double begin = M * M * w.dq_variance[u(i)] + B * B * w.q_variance[u(i)];
-      const double variance = w.white[u(i)] + end / (w.span * w.span) + begin * first * first;
+      for (int j = 0; j <= i; ++j)
+        for (int k = 0; k < n; ++k) V(i, j) += WE(i, k) * W(j, k);
+      const double B = filter_.damping()[u(i)];
+      const double friction = B * B * (filter_.variance(i) / (w.span * w.span) + w.q_variance[u(i)] * first * first);
+      const double variance = w.white[u(i)] + V(i, i) + friction;
       const double learnt = model_error_[u(i)] - least_model_error;
       w.hidden += variance * learnt / (learnt + noise_[u(i)] + 1e-12);
       std::array<double, 4> DP{};
@@ -396,7 +406,7 @@ class PayloadFilter {
         for (int l = 0; l < loads_; ++l) DP[u(k)] += w.lever[u(i)][u(l)] * filter_.covariance(2 * n + l, 2 * n + k);
       for (int j = 0; j <= i; ++j)
         for (int k = 0; k < loads_; ++k) V(i, j) += DP[u(k)] * w.lever[u(j)][u(k)];
-      V(i, i) += variance + (biases_ > 0 ? bias_variance(i) : 0.0);
+      V(i, i) += w.white[u(i)] + friction + (biases_ > 0 ? bias_variance(i) : 0.0);
     }
     return V;
   }
@@ -580,7 +590,8 @@ class PayloadFilter {
   double hidden_variance_ = 0.0;                      // of the mass, by torques that the learnt model error would hide [kg^2]
   double unsettled_ = 0.0;                            // for so long what is lacking tells nothing [s]
   double since_test_ = 0.0;                           // of what was felt lately [s]
-  static constexpr double doubtful = 4.0, certain = 5.0;  // standard deviations that make a torque no load's
+  static constexpr double doubtful = 4.0, certain = 7.0;  // standard deviations that make a torque no load's
+  static constexpr double lasting = 0.3;              // a doubt that stays for so long [s] is as certain
   double lately_evidence_ = 0.0;                      // such, at the last test
   double doubtful_time_ = 0.0;                        // for so long it has been [s]
   bool unlike_ = false;                               // something else than a load has certainly been felt
