@@ -56,11 +56,17 @@ class JointKalman {
   double dq(int i) const { return x_[u(N + i)]; }
   double parameter(int i) const { return x_[u(2 * N + i)]; }
   double variance(int i) const { return P_[u(i * dim_ + i)]; }
+  double covariance(int r, int c) const { return P_[u(std::max(r, c) * dim_ + std::min(r, c))]; }  // the upper triangle, by columns
   double parameter_variance(int i) const { return variance(2 * N + i); }
   palpate::JointVector positions() const { return slice(0); }
   palpate::JointVector velocities() const { return slice(N); }
   const palpate::JointVector& acceleration() const { return acceleration_; }
   const palpate::JointVector& inertia() const { return inertia_; }
+  const palpate::JointVector& damping() const { return damping_; }
+  palpate::JointVector torque_of(const palpate::JointVector& dq, const palpate::JointVector& ddq, double h) const {
+    const Vector torque = W_ * rival::in(ddq) + rival::in(damping_).cwiseProduct(rival::in(dq));
+    return rival::out(torque / h);
+  }
 
   void set(int i, double mean, double var) {
     x_[u(i)] = mean;
@@ -202,6 +208,9 @@ class JointKalman {
       armature[i] = h * theta[i] * slope[i];
       inertia_[u(i)] = M(i, i) + armature[i];
     }
+    damping_ = rival::out(slope);
+    W_ = M;
+    W_.diagonal() += armature;
     Square by_q, by_dq, Noise;
     const Vector ddq = dynamics_->forward_derivatives(q_m, v, given, armature, by_q, by_dq, Noise);
     acceleration_ = rival::out(ddq);
@@ -277,7 +286,8 @@ class JointKalman {
   int k_, dim_;
   double h_ = 0.0;
   Vector ht_ = Vector::Zero();  // h Theta
-  palpate::JointVector acceleration_{}, inertia_{}, rounded_at_{};
+  palpate::JointVector acceleration_{}, inertia_{}, damping_{}, rounded_at_{};
+  Square W_ = Square::Zero();
   Parameters decay_{};
   std::array<double, static_cast<std::size_t>(max_dim)> x_{}, K_{};
   std::array<double, static_cast<std::size_t>(max_dim* max_dim)> P_{};                // by columns, dim_ x dim_

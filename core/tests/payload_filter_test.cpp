@@ -263,6 +263,39 @@ TEST(PayloadFilter, NoticesGraspAndRelease) {
   }
 }
 
+TEST(PayloadFilter, APushIsNoMass) {  // level, at the grasp point: no load at any place of the hand takes such torques
+  for (std::uint64_t seed = 1; seed <= 6; ++seed)
+    for (double begin : {0.0, 2.0}) {
+      const Arm arm(description(seed));
+      const double mass = 0.7, end = begin + 2.0;
+      const Vec3<double> g = arm.gravity(), level = cross(g, Vec3<double>{0.3, -0.5, 0.8});
+      const Vec3<double> force = (5.0 / std::sqrt(dot(level, level))) * level;
+      Scene scene{.seconds = end + 3.0, .swing = seed % 2 == 0 ? 0.3 : 0.0, .q0 = pose(5)};
+      scene.events = [&](double t, Plant& plant) {
+        plant.load = palpate_test::point_load(arm, mass);
+        plant.push = {};
+        if (t < begin || t >= end) return;
+        const Pose<double> P = forward_kinematics<double>(arm, plant.q);
+        const Vec3<double> c = P.p + P.R * arm.p_last_grasp();
+        for (int j = 0; j < arm.n(); ++j) plant.push[at(j)] = dot(jacobian_column(arm, P, j, c), force);
+      };
+      Scale scale(arm);
+      Payload seen;
+      int pushed = 0, wrong = 0;
+      for (const RawSample& raw : sensed(arm, simulate(arm, scene), seed)) {
+        seen = scale.step(raw);
+        const double t = static_cast<double>(raw.time_ns) / 1e9;
+        if (t < begin || t >= end) continue;
+        ++pushed;
+        wrong += seen.status == Status::ok && std::abs(seen.mass - mass) > 3.0 * seen.mass_std;
+      }
+      SCOPED_TRACE("arm " + std::to_string(seed) + ", push from " + std::to_string(begin) + " s");
+      EXPECT_LE(wrong, 0.03 * pushed);
+      EXPECT_EQ(seen.status, Status::ok) << name(seen.status);
+      EXPECT_NEAR(seen.mass, mass, std::max(0.02 * mass, 3.5 * seen.mass_std));
+    }
+}
+
 TEST(PayloadFilter, InfinityDeclaresNoChange) {
   const Arm arm(description(1));
   Scene scene{.seconds = 3.0, .q0 = pose(5)};

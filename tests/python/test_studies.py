@@ -28,6 +28,7 @@ from palpate.studies import (
     grasp_and_release,
     mass_estimation,
     payload_filter,
+    pushes,
     replay,
     unknown_grasp,
     wrong_masses,
@@ -407,6 +408,28 @@ def test_tare_corrects_wrong_masses():
     found = wrong_masses.measure(wrong_masses.Job("some", factors, 3, ("StandBy",)))
     np.testing.assert_allclose(found.factors, factors, atol=0.02)
     assert _bench.late_percent(found.time, found.errors["StandBy", wrong_masses.TARED]) < 2.0
+
+
+def test_a_push_takes_ok_away_and_gives_it_back():
+    job = pushes.Job("katana_450_6m90a", 11)
+    seen = pushes.measure(job)
+    assert [s.filter for s in seen] == [_bench.MASS_ONLY, _bench.DEFAULT]
+    for s in seen:
+        assert s.pushed.begin > 0.0 and s.ok[s.time < s.pushed.begin].any()
+        assert np.mean(s.wrong) < 0.01 and np.mean(s.ok[s.during]) < 0.3
+        assert s.back < pushes.BACK
+
+
+def test_back_after_a_push_is_when_it_stays_right():
+    time = np.arange(0.0, 10.0, 0.1)
+    pushed = pushes.Pushed("arm", 1.0, False, 2.0, 5.0, 10.0, 30.0, 3, False)
+    error = np.where(time < 6.45, 0.5, 0.01)
+    ok = (time < 2.0) | (time > 5.95)
+    seen = pushes.Seen(pushed, "filter", time, error, np.full_like(time, 0.1), ok)
+    assert seen.back == pytest.approx(1.5)  # ok from 6.0 s, right from 6.5 s
+    assert np.count_nonzero(seen.during) == 30 and np.count_nonzero(seen.wrong & ~seen.during) == 20 + 5
+    never = seen._replace(ok=np.zeros_like(ok))
+    assert never.back == math.inf and not never.wrong.any()
 
 
 def test_grasp_and_release_are_timed_from_the_instant():

@@ -118,7 +118,7 @@ def test_a_load_held_from_the_start_is_never_ok_with_a_wrong_number(name: str, m
         payload = trial(name, mass=mass, loads=((0.0, mass),), duration=3.0, seed=seed).touch.payload
         ok = payload.status == int(pp.Status.ok)
         error = np.abs(payload.mass - mass)[ok] / payload.mass_std[ok]
-        assert np.count_nonzero(ok) > 300
+        assert np.count_nonzero(ok) > 250  # of 751; dry friction is doubted for a while
         assert np.max(error) < 5.0
         assert np.mean(error < W.weighing.TWO_SIDED_95) > 0.9
         assert payload.changes[-1] == 0

@@ -50,6 +50,21 @@ class JointKalman {
   /// q'' and the diagonal of W in the last prediction [rad/s^2, kg m^2].
   const JointVector& acceleration() const noexcept { return acceleration_; }
   const JointVector& inertia() const noexcept { return inertia_; }
+  /// The constant torque [N m] that steps of h seconds would have lacked, had they to be corrected by the same change of
+  /// (q, q') each: M dq'/h, and dq/h is a velocity that friction, of slope B, would have damped.
+  JointVector torque_of(const JointVector& dq, const JointVector& ddq, double h) const noexcept {
+    JointVector out{};
+    for (int i = 0; i < n_; ++i) {
+      double sum = slope_[u(i)] * dq[u(i)];
+      for (int j = 0; j < n_; ++j) sum += W_(i, j) * ddq[u(j)];
+      out[u(i)] = sum / h;
+    }
+    return out;
+  }
+  /// The mass matrix of the last prediction, with what friction adds in a step [kg m^2].
+  const JointMatrix& mass() const noexcept { return W_; }
+  /// Slope of friction over q' in the last prediction [N m s/rad].
+  const JointVector& damping() const noexcept { return slope_; }
   JointVector velocities() const noexcept { return slice(n_); }
 
   void set(int i, double mean, double var) noexcept {
@@ -104,24 +119,24 @@ class JointKalman {
     JointVector rest{};
     if (in.load_rest.m != 0.0 || in.load_rest.mc.x != 0.0 || in.load_rest.mc.y != 0.0 || in.load_rest.mc.z != 0.0)
       rest = chain.body_torque(n_ - 1, moved(chain.pose().R, chain.pose().p, in.load_rest));
-    JointMatrix W = mass_matrix<double>(arm, q_m, in.load);
-    JointVector r{}, slope{};
+    W_ = mass_matrix<double>(arm, q_m, in.load);
+    JointVector r{};
     for (int i = 0; i < n_; ++i) {
       const Friction friction = expected_friction(arm, i);
       // Friction that falls with speed (Stribeck) keeps its value over the step: extrapolated, a light joint would run away.
-      slope[u(i)] = std::max(friction.derivative(v[u(i)]), 0.0);
-      const double x = h * slope[u(i)] / W(i, i);
+      slope_[u(i)] = std::max(friction.derivative(v[u(i)]), 0.0);
+      const double x = h * slope_[u(i)] / W_(i, i);
       theta_[u(i)] = weight(x);
       r[u(i)] = h * (in.tau[u(i)] - friction.torque(v[u(i)]) - bias[u(i)] - rest[u(i)]);
       if (torque_ >= 0) r[u(i)] += h * parameter(torque_ + i);
     }
-    for (int i = 0; i < n_; ++i) W(i, i) += h * theta_[u(i)] * slope[u(i)];
-    const Cholesky<double> factor(W, n_);
+    for (int i = 0; i < n_; ++i) W_(i, i) += h * theta_[u(i)] * slope_[u(i)];
+    const Cholesky<double> factor(W_, n_);
     const JointVector dv = factor.solve(r);
     JointVector a{};
     for (int i = 0; i < n_; ++i) {
       a[u(i)] = dv[u(i)] / h;
-      inertia_[u(i)] = W(i, i);
+      inertia_[u(i)] = W_(i, i);
     }
     acceleration_ = a;
 
@@ -140,7 +155,7 @@ class JointKalman {
         row[j] = -h * Jq(i, j);
         row[n_ + j] = -h * (Jv(i, j) + 0.5 * h * Jq(i, j));
       }
-      row[n_ + i] -= h * slope[u(i)];
+      row[n_ + i] -= h * slope_[u(i)];
       for (int p = 0; p < dynamic; ++p) row[2 * n_ + p] = -h * D[u(i * dynamic + p)];
       for (int j = 0; j < n_; ++j) row[active_ + j] = i == j ? h : 0.0;
     }
@@ -332,7 +347,8 @@ class JointKalman {
   int active_;  // states the dynamics depend on: all but the encoder errors, which come last
   double h_ = 0.0;
   std::array<double, max_dim> x_{}, K_{}, p_{};
-  JointVector theta_{}, acceleration_{}, inertia_{}, rounded_at_{};
+  JointVector theta_{}, slope_{}, acceleration_{}, inertia_{}, rounded_at_{};
+  JointMatrix W_{};
   Parameters decay_{};
   Matrix P_{}, T_{};
   std::array<double, static_cast<std::size_t>(max_joints*(max_dim + max_joints))> X_{};

@@ -88,9 +88,18 @@ class PayloadFilter {
     }
     const int steps = 1 + static_cast<int>(s.dt / config_.max_step);
     for (int k = 0; k < steps; ++k) predict(s, s.dt / steps);
-    const double smoothing = -std::expm1(-s.dt / 0.3);
-    filter_.measure_joints(*arm_, s, [this, smoothing](int i, int e, const Filter::Update& update) {
-      if (i < arm_->n()) surprise_[u(i)] += smoothing * (std::min(update.y * update.y / update.s, 100.0) - surprise_[u(i)]);
+    const double smoothing = -std::expm1(-s.dt / memory), quick = -std::expm1(-s.dt / 0.03);
+    JointVector dq{}, ddq{};  // corrections of (q, q')
+    filter_.measure_joints(*arm_, s, [&](int i, int e, const Filter::Update& update) {
+      if (i < arm_->n()) {
+        const double square = std::min(update.y * update.y / update.s, 100.0);
+        surprise_[u(i)] += smoothing * (square - surprise_[u(i)]);
+        recent_surprise_[u(i)] += quick * (square - recent_surprise_[u(i)]);
+      }
+      for (int j = 0; j < arm_->n(); ++j) {
+        dq[u(j)] += update.K[j] * update.y;
+        ddq[u(j)] += update.K[arm_->n() + j] * update.y;
+      }
       for (Hypothesis& hyp : hypotheses_) {
         const double seen = hyp.e[u(i)] + (e >= 0 ? hyp.e[u(e)] : 0.0);
         hyp.num += seen * update.y / update.s;
@@ -103,6 +112,7 @@ class PayloadFilter {
       begin(s);
       return report(s, Status::warming);
     }
+    look_for_unexplained(filter_.torque_of(dq, ddq, s.dt), s.dt);
     learn_model_error(s.dt);
     unexplained_time_ = explained() ? 0.0 : unexplained_time_ + s.dt;
     // Lost: it explains nothing, or by a load that weighs less than nothing.
@@ -165,16 +175,32 @@ class PayloadFilter {
     std::int64_t since;                     ///< [ns]
   };
 
+  /// Averages over the last `memory` seconds, exponentially weighted once they are past.
+  struct Window {
+    double memory;                                               ///< [s]
+    double span = 0.0, first = 1.0;                              ///< so far [s]; weight of the first sample
+    JointVector torque{};                                        ///< lacking - D theta^ + b^ [N m]
+    std::array<std::array<double, 4>, max_joints> lever{};       ///< D
+    JointVector rho{}, white{}, q_variance{};                    ///< the last when it began
+    JointMatrix dq_covariance{};                                 ///< likewise
+    double hidden = 0.0;                                         ///< part of V's diagonal that the learnt model error makes
+  };
+
   void begin(const JointSample& s) noexcept {
     filter_.start(*arm_, s, config_.velocity_prior_std);
     regime_ = detail::Regime(presliding);
     for (int i = 0; i < biases_; ++i) redraw_bias(i);
     started_ = true;
     restart_hypotheses();
+    unsettled_ = least_span;
   }
   void forget_everything() noexcept {
     surprise_.fill(1.0);
-    unexplained_variance_ = unexplained_time_ = 0.0;
+    recent_surprise_.fill(1.0);
+    hidden_variance_ = unexplained_time_ = 0.0;
+    doubt_.fill(0.0);
+    unlike_ = false;
+    lately_evidence_ = doubtful_time_ = 0.0;
     mass_before_ = known_time_ = 0.0;
     mass_prior_std_ = initial_prior_std_;
     model_error_.fill(least_model_error);
@@ -247,9 +273,10 @@ class PayloadFilter {
       if (regime_.changed(*arm_, i, filter_.q(i), filter_.dq(i))) redraw_bias(i);
       decay_[u(loads_ + i)] = phi;
     }
-    JointVector variance = torque_variance_;
+    noise_ = torque_variance_;
+    add_neglected(noise_, h);
+    JointVector variance = noise_;
     for (int i = 0; i < arm_->n(); ++i) variance[u(i)] += model_error_[u(i)];
-    add_neglected(variance, h);
     const Inertia<double> state = load_of_state(), real = moving(state);
     const Inertia<double> rest{state.m - real.m, state.mc - real.mc, Sym3<double>{}};
     const int last = arm_->n() - 1;
@@ -267,17 +294,153 @@ class PayloadFilter {
     }
   }
 
-  /// An arm whose model is wrong surprises its filter: the innovations' y^2/S, 1 on average, stays above it. A torque
-  /// variance per joint then grows until they fit, fast, and shrinks again, slowly. The filter takes it for white; but it may
-  /// as well stay, so that no averaging removes it: the interval that is reported counts it once more, as a constant torque.
+  /// An arm whose model is wrong, or that is pushed, surprises its filter: the innovations' y^2/S, 1 on average, stays above it.
+  /// A torque variance per joint then grows until they fit, at once, and shrinks again: to what the unexplained torque shows
+  /// within the time that is known over, below that slowly. The filter takes it for white; but it may as well stay, so that no
+  /// averaging removes it: what it does to the mass is told by look_for_unexplained().
   void learn_model_error(double dt) noexcept {
     for (int i = 0; i < arm_->n(); ++i) {
-      const double excess = surprise_[u(i)] - 1.3;
-      const double rate = excess > 0.0 ? std::min(excess, 3.0) / 0.02 : std::max(excess, -1.0) / 1.0;
-      const double factor = std::exp(std::min(rate * dt, 2.0));
-      model_error_[u(i)] = std::clamp(model_error_[u(i)] * factor, least_model_error, 1e6);
+      double& variance = model_error_[u(i)];
+      const double lacks = std::max(std::abs(now_.rho[u(i)]), std::abs(lacking_[u(i)]));
+      const double shown = 4.0 * lacks * lacks, excess = std::min(surprise_[u(i)], recent_surprise_[u(i)]) - 1.3;
+      if (variance > shown) variance = std::max(shown, variance * std::exp(-2.0 * dt / memory));
+      else if (excess > 0.0) variance = std::min(shown, variance * std::exp(std::min(std::min(excess, 3.0) / 0.02 * dt, 2.0)));
+      else variance *= std::exp(dt * std::max(surprise_[u(i)] - 1.3, -1.0));
+      variance = std::clamp(variance, least_model_error, 1e6);
     }
   }
+
+  void restart(Window& w) noexcept {
+    w.span = 0.0;
+    w.first = 1.0;
+    w.torque = w.white = w.rho = {};
+    w.lever = {};
+    for (int i = 0; i < arm_->n(); ++i) {
+      w.q_variance[u(i)] = filter_.variance(i);
+      for (int j = 0; j <= i; ++j) w.dq_covariance(i, j) = w.dq_covariance(j, i) = filter_.covariance(arm_->n() + i, arm_->n() + j);
+    }
+  }
+  /// A push is no load: its torques stand to each other as no load's do. What the state lacks to follow the positions, as a
+  /// torque (JointKalman::torque_of), is averaged over the last 0.3 s, and over 3 s as long as it stays the same:
+  ///   rho = mean(lacking - D theta^ + b^) + mean(D) theta^ ~ N(0, V),   D the torque per unit of theta, theta^ the estimate,
+  ///   V = noise/N + (W cov(q') W + var(B q))(begin, end)/span^2 + var(b) + mean(D) P mean(D)^T
+  /// where a load is all there is. If rho^T V^-1 rho says otherwise, any part of what looks like a load may
+  /// be none: a parameter is then not known better than rho^2/D^2, the change that would take as much torque, times
+  /// n/(n - parameters), for so much of a torque the fit has taken on itself. When it is over, what was learnt meanwhile is as
+  /// doubtful, and is learnt anew.
+  void look_for_unexplained(const JointVector& lacking, double dt) noexcept {
+    const int n = arm_->n();
+    unsettled_ -= dt;
+    if (unsettled_ > 0.0) restart(now_);  // corrections are still those of the guess it began with
+    if (now_.span < now_.memory) restart(lately_);
+    for (double& doubt : doubt_) doubt *= std::exp(-dt / 0.1);
+    average(now_, lacking, dt);
+    average(lately_, lacking, dt);
+    const Cholesky<double> V(covariance(now_, dt), n);
+    hidden_variance_ = now_.hidden / std::max(squared_lever(now_, 0), 1e-12);
+    double evidence = now_.span < least_span ? 0.0 : deviations(V, now_.rho);
+    if (evidence > doubtful) {
+      doubt(now_, evidence);
+      restart(lately_);
+    }
+    since_test_ += dt;
+    if (since_test_ >= 0.02) {
+      since_test_ = 0.0;
+      JointVector change{};
+      for (int i = 0; i < n; ++i) change[u(i)] = lately_.rho[u(i)] - now_.rho[u(i)];
+      if (now_.span >= least_span && deviations(V, change) > doubtful) restart(lately_);
+      lately_evidence_ = lately_.span < least_span ? 0.0 : deviations(Cholesky<double>(covariance(lately_, dt), n), lately_.rho);
+      if (lately_evidence_ > doubtful) doubt(lately_, lately_evidence_);
+    }
+    evidence = std::max(evidence, lately_evidence_);
+    if (unlike_ && evidence < doubtful) {
+      for (int k = 0; k < loads_; ++k) filter_.add_parameter_variance(k, doubt_[u(k)]);
+      unlike_ = false;
+    }
+    doubtful_time_ = evidence > doubtful ? doubtful_time_ + dt : 0.0;
+    unlike_ = unlike_ || evidence > certain || doubtful_time_ > lasting;
+    const double quick = -std::expm1(-dt / 0.03);
+    for (int i = 0; i < n; ++i) lacking_[u(i)] += quick * (lacking[u(i)] - lacking_[u(i)]);
+  }
+  void average(Window& w, const JointVector& lacking, double dt) noexcept {
+    w.span = std::min(w.span + dt, w.memory);
+    const double a = std::min(dt / w.span, 1.0);
+    w.first = w.span < w.memory ? a : w.first * (1.0 - a);
+    for (int i = 0; i < arm_->n(); ++i) {
+      const auto& D = lever_[u(i)];
+      auto& mean = w.lever[u(i)];
+      double torque = lacking[u(i)] + (biases_ > 0 ? filter_.parameter(loads_ + i) : 0.0), expected = 0.0;
+      for (int k = 0; k < loads_; ++k) {
+        torque -= D[u(k)] * filter_.parameter(k);
+        mean[u(k)] += a * (D[u(k)] - mean[u(k)]);
+        expected += mean[u(k)] * filter_.parameter(k);
+      }
+      w.torque[u(i)] += a * (torque - w.torque[u(i)]);
+      w.rho[u(i)] = w.torque[u(i)] + expected;
+      w.white[u(i)] = (1.0 - a) * (1.0 - a) * w.white[u(i)] + a * a * noise_[u(i)];
+    }
+  }
+  /// V, the lower triangle.
+  JointMatrix covariance(Window& w, double dt) const noexcept {
+    const int n = arm_->n();
+    JointMatrix V{};
+    w.hidden = 0.0;
+    const double first = w.first / dt;
+    const JointMatrix& W = filter_.mass();
+    JointMatrix WE{};  // W times the covariance of (q'(end) - q'(begin))/span
+    for (int k = 0; k < n; ++k)
+      for (int l = 0; l < n; ++l) {
+        const double E = filter_.covariance(n + std::max(k, l), n + std::min(k, l)) / (w.span * w.span) + w.dq_covariance(k, l) * first * first;
+        for (int i = 0; i < n; ++i) WE(i, l) += W(i, k) * E;
+      }
+    for (int i = 0; i < n; ++i) {
+      for (int j = 0; j <= i; ++j)
+        for (int k = 0; k < n; ++k) V(i, j) += WE(i, k) * W(j, k);
+      const double B = filter_.damping()[u(i)];
+      const double friction = B * B * (filter_.variance(i) / (w.span * w.span) + w.q_variance[u(i)] * first * first);
+      const double variance = w.white[u(i)] + V(i, i) + friction;
+      const double learnt = model_error_[u(i)] - least_model_error;
+      w.hidden += variance * learnt / (learnt + noise_[u(i)] + 1e-12);
+      std::array<double, 4> DP{};
+      for (int k = 0; k < loads_; ++k)
+        for (int l = 0; l < loads_; ++l) DP[u(k)] += w.lever[u(i)][u(l)] * filter_.covariance(2 * n + l, 2 * n + k);
+      for (int j = 0; j <= i; ++j)
+        for (int k = 0; k < loads_; ++k) V(i, j) += DP[u(k)] * w.lever[u(j)][u(k)];
+      V(i, i) += w.white[u(i)] + friction + (biases_ > 0 ? bias_variance(i) : 0.0);
+    }
+    return V;
+  }
+  /// x^T V^-1 x in standard deviations of the normal distribution that has as rare values (Wilson, Hilferty 1931).
+  double deviations(const Cholesky<double>& V, const JointVector& x) const noexcept {
+    const JointVector y = V.solve(x);
+    double chi_square = 0.0;
+    for (int i = 0; i < arm_->n(); ++i) chi_square += x[u(i)] * y[u(i)];
+    const double part = 2.0 / (9.0 * arm_->n());
+    return (std::cbrt(chi_square / arm_->n()) - 1.0 + part) / std::sqrt(part);
+  }
+  double squared_lever(const Window& w, int k) const noexcept {
+    double sum = 0.0;
+    for (int i = 0; i < arm_->n(); ++i) sum += w.lever[u(i)][u(k)] * w.lever[u(i)][u(k)];
+    return sum;
+  }
+  void doubt(const Window& w, double evidence) noexcept {
+    const int n = arm_->n();
+    double squares = 0.0, as_mass = 0.0;
+    for (int i = 0; i < n; ++i) {
+      squares += w.rho[u(i)] * w.rho[u(i)];
+      as_mass -= w.lever[u(i)][0] * w.rho[u(i)];
+    }
+    const double taken = static_cast<double>(n) / std::max(n - loads_, 1);
+    for (int k = 0; k < loads_; ++k) {
+      const double prior = k == 0 ? mass_prior_std_ : config_.offset_prior_std * bounding_mass_;
+      doubt_[u(k)] = std::max(doubt_[u(k)], std::min(taken * squares / std::max(squared_lever(w, k), 1e-12), prior * prior));
+    }
+    // What is a mass but for a rest that is small beside it, and was overlooked for the filter thought it knew better: learnt.
+    const double lever = std::max(squared_lever(w, 0), 1e-12), mass_square = as_mass * as_mass / (lever * lever);
+    const double missing = mass_square - filter_.parameter_variance(0);
+    if (evidence > certain && missing > 0.0 && mass_square * lever * (n - 1) > 4.0 * (squares - mass_square * lever)) filter_.add_parameter_variance(0, missing);
+  }
+
   /// Whether the state explains what every joint does now.
   bool explained() const noexcept {
     return std::all_of(surprise_.begin(), surprise_.begin() + arm_->n(), [](double s) { return s < 2.0; });
@@ -317,16 +480,19 @@ class PayloadFilter {
       }
     }
     most_share_ = 0.0;
-    double information = 0.0;  // about the mass, were the learnt model error a constant torque [1/kg^2]
+    const Mat3<double> R = P.R * arm_->R_last_tip();
+    const std::array<Vec3<double>, 3> tip{R.cx, R.cy, R.cz};
     for (int i = 0; i < arm_->n(); ++i) {
-      const double torque = dot(J[u(i)], a_c - g), share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
+      const double torque = dot(J[u(i)], a_c - g);
+      lever_[u(i)][0] = torque;
+      if (!arm_->body(i).prismatic)
+        for (int k = 1; k < loads_; ++k) lever_[u(i)][u(k)] = dot(cross(P.axis[u(i)], tip[u(k - 1)]), a_c - g);
+      const double share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
       most_share_ = std::max(most_share_, share);
       variance[u(i)] += samples * mass_variance * torque * torque * std::min(1.0, mass_variance * share * share);
       const double turning = arm_->body(i).prismatic ? 0.0 : own_inertia * dot(P.axis[u(i)], spin);
       variance[u(i)] += samples * turning * turning;
-      information += torque * torque / std::max(model_error_[u(i)] - least_model_error, 1e-12);
     }
-    unexplained_variance_ = 1.0 / std::max(information, 1e-12);
   }
 
   void start_hypothesis(Hypothesis& hyp, std::int64_t now) noexcept {
@@ -380,6 +546,7 @@ class PayloadFilter {
       if (!correction) set_offset_prior();
       mass_before_ = filter_.parameter(0);
       restart_hypotheses();
+      unsettled_ = memory;
       return;
     }
     for (Hypothesis& hyp : hypotheses_)
@@ -391,17 +558,17 @@ class PayloadFilter {
   Payload report(const JointSample&, Status status) const noexcept {
     Payload out;
     out.mass = filter_.parameter(0);
-    out.mass_std = std::hypot(mass_std(), std::sqrt(unexplained_variance_), out.mass - mass_before_);
+    out.mass_std = std::hypot(mass_std(), std::sqrt(doubt_[0] + hidden_variance_), out.mass - mass_before_);
     for (int k = 1; k < loads_; ++k) {
       out.first_moment[u(k - 1)] = filter_.parameter(k);
-      out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0));
+      out.first_moment_std[u(k - 1)] = std::sqrt(std::max(filter_.parameter_variance(k), 0.0) + doubt_[u(k)]);
     }
     out.changes = changes_;
     out.change_time_ns = change_time_ns_;
     out.status = status;
     const bool sure = out.mass_std <= std::max(config_.ok_relative * std::abs(out.mass), config_.ok_absolute);
     const bool possible = out.mass >= -std::max(3.0 * out.mass_std, config_.ok_absolute);
-    if (status == Status::ok && !(sure && possible && explained())) out.status = Status::warming;
+    if (status == Status::ok && !(sure && possible && explained() && now_.span >= least_span)) out.status = Status::warming;
     return out;
   }
 
@@ -412,7 +579,22 @@ class PayloadFilter {
   Filter filter_;
   std::array<Inertia<double>, 4> unit_;
   static constexpr double least_model_error = 1e-6;  // [N^2 m^2]
-  JointVector tau_{}, torque_variance_{}, surprise_{}, model_error_{};
+  static constexpr double memory = 0.3;              // over which surprise and unexplained torque are averaged [s]
+  JointVector tau_{}, torque_variance_{}, surprise_{}, recent_surprise_{}, model_error_{};
+  JointVector noise_{};                               // of the torque without the model error, per step [N^2 m^2]
+  std::array<std::array<double, 4>, max_joints> lever_{};  // torque per parameter of the load
+  JointVector lacking_{};                             // over 0.03 s [N m]
+  Window now_{.memory = memory}, lately_{.memory = 10.0 * memory};
+  static constexpr double least_span = 0.1;           // before which a window tells nothing [s]
+  std::array<double, 4> doubt_{};                     // variances of the load's parameters while something else is felt
+  double hidden_variance_ = 0.0;                      // of the mass, by torques that the learnt model error would hide [kg^2]
+  double unsettled_ = 0.0;                            // for so long what is lacking tells nothing [s]
+  double since_test_ = 0.0;                           // of what was felt lately [s]
+  static constexpr double doubtful = 4.0, certain = 7.0;  // standard deviations that make a torque no load's
+  static constexpr double lasting = 0.3;              // a doubt that stays for so long [s] is as certain
+  double lately_evidence_ = 0.0;                      // such, at the last test
+  double doubtful_time_ = 0.0;                        // for so long it has been [s]
+  bool unlike_ = false;                               // something else than a load has certainly been felt
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
   static constexpr double lag = 0.1;          // errors of linearisation last about so long [s]
@@ -423,7 +605,6 @@ class PayloadFilter {
   std::uint32_t changes_ = 0;
   std::int64_t change_time_ns_ = 0, change_seen_ns_ = 0;
   double last_jump_ = 0.0;  // [kg]
-  double unexplained_variance_ = 0.0;  // of the mass, by what the model gets wrong [kg^2]
   double unexplained_time_ = 0.0;      // [s]
   double mass_before_ = 0.0;           // the estimate about `lag` ago [kg]
   double known_time_ = 0.0;            // `ok` without a break since the load was forgotten, up to known_after [s]

@@ -123,6 +123,7 @@ _ALL = (
     Study("teleoperation", "A hand feels what a light arm touches, without a force sensor", "reproduce"),
     Study("payload-filter", "The payload Kalman filter on the published bench", "bench"),
     Study("unknown-grasp", "The object is not held where it was thought", "bench"),
+    Study("pushes", "Somebody pushes on the arm while it weighs", "bench"),
     Study("wrong-masses", "The arm's links do not weigh what the model says", "bench"),
     Study("grasp-and-release", "An object is taken and dropped at unknown times", "bench"),
     Study(

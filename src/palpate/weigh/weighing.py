@@ -588,7 +588,7 @@ def _two_way(result: Weighing) -> TwoWayMotion | None:
         return None
     q = result.log.position[finite][-1]
     stiction = stiction_std(result.arm, q)
-    if not 0.5 * stiction < result.mass_std < 5.0 * stiction:  # far more than stiction has another reason
+    if not 0.5 * stiction < result.mass_std < 20.0 * stiction:  # far more than stiction has another reason
         return None
     return two_way_motion(result.arm, q)
 
