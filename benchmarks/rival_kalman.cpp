@@ -63,6 +63,12 @@ class JointKalman {
   const palpate::JointVector& acceleration() const { return acceleration_; }
   const palpate::JointVector& inertia() const { return inertia_; }
   const palpate::JointVector& damping() const { return damping_; }
+  palpate::JointMatrix mass() const {
+    palpate::JointMatrix out{};
+    for (int i = 0; i < N; ++i)
+      for (int j = 0; j < N; ++j) out(i, j) = W_(i, j);
+    return out;
+  }
   palpate::JointVector torque_of(const palpate::JointVector& dq, const palpate::JointVector& ddq, double h) const {
     const Vector torque = W_ * rival::in(ddq) + rival::in(damping_).cwiseProduct(rival::in(dq));
     return rival::out(torque / h);

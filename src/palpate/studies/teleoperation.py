@@ -80,8 +80,8 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     next_one()
     rigid: dict[str, Contact] = {}
     for name, stiffest in (("gives way", STIFFEST), ("does not give way", math.inf)):
-        found = build("rigid", stiffest=stiffest).run(seconds=4.0 if quick else PRESSED_UNTIL)
-        rigid[name] = contact(found, PRESSED_UNTIL)
+        until = 4.0 if quick else PRESSED_UNTIL
+        rigid[name] = contact(build("rigid", stiffest=stiffest).run(seconds=until), until)
         next_one()
     coupled: dict[str, Transparency] = {}
     for coupling in COUPLINGS:

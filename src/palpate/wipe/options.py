@@ -9,7 +9,6 @@ from typing import Literal
 from ..errors import InputError
 from .strokes import Motion
 
-
 FASTEST = 0.3
 """[m/s]"""
 
