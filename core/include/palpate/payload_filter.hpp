@@ -337,7 +337,8 @@ class PayloadFilter {
     average(now_, lacking, dt);
     average(lately_, lacking, dt);
     const Cholesky<double> V(covariance(now_, dt), n);
-    hidden_variance_ = now_.hidden / std::max(squared_lever(now_, 0), 1e-12);
+    const double unknown = mass_prior_std_ * mass_prior_std_;
+    hidden_variance_ = V.positive() ? std::min(unknown, now_.hidden / std::max(squared_lever(now_, 0), 1e-12)) : unknown;
     double evidence = now_.span < least_span ? 0.0 : deviations(V, now_.rho);
     if (evidence > doubtful) {
       doubt(now_, evidence);
@@ -411,7 +412,9 @@ class PayloadFilter {
     return V;
   }
   /// x^T V^-1 x in standard deviations of the normal distribution that has as rare values (Wilson, Hilferty 1931).
+  /// Where rounding leaves no V, nothing is sure.
   double deviations(const Cholesky<double>& V, const JointVector& x) const noexcept {
+    if (!V.positive()) return 2.0 * certain;
     const JointVector y = V.solve(x);
     double chi_square = 0.0;
     for (int i = 0; i < arm_->n(); ++i) chi_square += x[u(i)] * y[u(i)];
@@ -433,7 +436,7 @@ class PayloadFilter {
     const double taken = static_cast<double>(n) / std::max(n - loads_, 1);
     for (int k = 0; k < loads_; ++k) {
       const double prior = k == 0 ? mass_prior_std_ : config_.offset_prior_std * bounding_mass_;
-      doubt_[u(k)] = std::max(doubt_[u(k)], std::min(taken * squares / std::max(squared_lever(w, k), 1e-12), prior * prior));
+      doubt_[u(k)] = std::max(doubt_[u(k)], std::min(prior * prior, taken * squares / std::max(squared_lever(w, k), 1e-12)));
     }
     // What is a mass but for a rest that is small beside it, and was overlooked for the filter thought it knew better: learnt.
     const double lever = std::max(squared_lever(w, 0), 1e-12), mass_square = as_mass * as_mass / (lever * lever);
