@@ -715,13 +715,15 @@ def test_noise_on_the_line_is_not_an_answer(make: str) -> None:
 
 
 @pytest.mark.parametrize("make", MAKES)
-def test_a_late_answer_does_not_pass_for_the_next(make: str) -> None:
+def test_a_late_answer_does_not_pass_for_the_next(make: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The adapter holds everything back for 25 ms while the arm moves on."""
-    with bus(make) as emulator, driver(make, emulator.port, patience=5) as arm_on_bus:
+    emulator = bus(make, **BUS)
+    SimulatedLine(emulator, monkeypatch)
+    with driver(make, emulator.port, patience=5) as arm_on_bus:
         assert arm_on_bus.read() is not None
         emulator.usb = 0.025
         assert arm_on_bus.read() is None
-        emulator.usb = 0.0
+        emulator.usb = BUS["usb"]
         emulator.world.q = Q + 0.1
         for _ in range(4):
             sample = arm_on_bus.read()
