@@ -61,7 +61,6 @@ class JointKalman {
   palpate::JointVector positions() const { return slice(0); }
   palpate::JointVector velocities() const { return slice(N); }
   const palpate::JointVector& acceleration() const { return acceleration_; }
-  const palpate::JointVector& inertia() const { return inertia_; }
   const palpate::JointVector& damping() const { return damping_; }
   palpate::JointMatrix mass() const {
     palpate::JointMatrix out{};
@@ -135,6 +134,16 @@ class JointKalman {
       update = measure_upper<2 * N + loads + (torques ? N : 0) + (encoders ? N : 0)>(i, e, z, R);
     });
     return update;
+  }
+  using Innovation = typename palpate::JointKalman<max_parameters>::Innovation;
+  Innovation innovation(const palpate::Arm& arm, const palpate::JointSample& sample, int i) const {
+    Innovation out{sample.q[u(i)] - q(i), variance(i) + std::max(arm.position_variance(i), least_variance)};
+    if (encoders_) {
+      const int e = dim_ - N + i;
+      out.y -= x_[u(e)];
+      out.s += 2.0 * covariance(i, e) + variance(e);
+    }
+    return out;
   }
   template <class Seen>
   void measure_joints(const palpate::Arm& arm, const palpate::JointSample& s, Seen&& seen) {
@@ -212,7 +221,6 @@ class JointKalman {
       given[i] -= friction.torque(v[i]);
       theta[i] = weight(h * slope[i] / M(i, i));
       armature[i] = h * theta[i] * slope[i];
-      inertia_[u(i)] = M(i, i) + armature[i];
     }
     damping_ = rival::out(slope);
     W_ = M;
@@ -292,7 +300,7 @@ class JointKalman {
   int k_, dim_;
   double h_ = 0.0;
   Vector ht_ = Vector::Zero();  // h Theta
-  palpate::JointVector acceleration_{}, inertia_{}, damping_{}, rounded_at_{};
+  palpate::JointVector acceleration_{}, damping_{}, rounded_at_{};
   Square W_ = Square::Zero();
   Parameters decay_{};
   std::array<double, static_cast<std::size_t>(max_dim)> x_{}, K_{};

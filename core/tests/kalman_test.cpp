@@ -351,6 +351,29 @@ TEST(JointKalman, AMeasurementIsTheTextbookUpdate) {
   }
 }
 
+TEST(JointKalman, AnInnovationIsThatOfTheMeasurementToCome) {
+  for (bool encoders : {true, false}) {
+    ArmDescription d = turntable(0.3, {});
+    d.joints[0].position_resolution = 2e-3;
+    d.joints[0].position_std = 1e-4;
+    const Arm arm(d);
+    Rig rig(arm, 0, true, encoders);
+    rig.torque_variance = {0.1};
+    JointSample s;
+    s.status = Status::ok;
+    rig.filter.start(arm, s, 1.0);
+    for (int k = 0; k < 5; ++k) {
+      rig.predict(0.004, {1.0});
+      s.q[0] = 2e-3 * k;
+      const Filter::Innovation foretold = rig.filter.innovation(arm, s, 0);
+      rig.filter.measure_joints(arm, s, [&](int, int, const auto& update) {
+        EXPECT_DOUBLE_EQ(update.y, foretold.y);
+        EXPECT_NEAR(update.s, foretold.s, 1e-12 * foretold.s);
+      });
+    }
+  }
+}
+
 TEST(JointKalman, AMeasuredVelocityIsUsedWhereItsStdIsDeclared) {
   ArmDescription d = turntable(0.3, {});
   d.joints[0].position_std = 1e-3;

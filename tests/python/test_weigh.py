@@ -64,13 +64,13 @@ def test_weighs_a_quarter_kilogram_in_every_pose(pose: str) -> None:
     assert result.pose == pose and not result.interrupted
 
 
-@pytest.mark.parametrize("name", [n for n in pp.robots.names() if n != "abb_irb2400_16"])
+@pytest.mark.parametrize("name", pp.robots.names())
 def test_every_reference_arm_weighs(name: str) -> None:
     result = W.weigh_trial(trial(name))
     assert result.status == pp.Status.ok
     assert abs(result.error_percent) < 2.0
     assert result.time_to_2_percent < 3.0
-    assert result.goal_error < 0.02
+    assert result.goal_error < (0.1 if name == "abb_irb2400_16" else 0.02)  # dry friction holds that one short of it
 
 
 def test_the_goal_is_reached_with_what_was_weighed() -> None:
@@ -118,7 +118,7 @@ def test_a_load_held_from_the_start_is_never_ok_with_a_wrong_number(name: str, m
         payload = trial(name, mass=mass, loads=((0.0, mass),), duration=3.0, seed=seed).touch.payload
         ok = payload.status == int(pp.Status.ok)
         error = np.abs(payload.mass - mass)[ok] / payload.mass_std[ok]
-        assert np.count_nonzero(ok) > 250  # of 751; dry friction is doubted for a while
+        assert np.count_nonzero(ok) > 400  # of 751
         assert np.max(error) < 5.0
         assert np.mean(error < W.weighing.TWO_SIDED_95) > 0.9
         assert payload.changes[-1] == 0

@@ -47,9 +47,8 @@ class JointKalman {
   double variance(int i) const noexcept { return covariance(i, i); }
   double parameter_variance(int i) const noexcept { return variance(2 * n_ + i); }
   JointVector positions() const noexcept { return slice(0); }
-  /// q'' and the diagonal of W in the last prediction [rad/s^2, kg m^2].
+  /// q'' in the last prediction [rad/s^2].
   const JointVector& acceleration() const noexcept { return acceleration_; }
-  const JointVector& inertia() const noexcept { return inertia_; }
   /// The constant torque [N m] that steps of h seconds would have lacked, had they to be corrected by the same change of
   /// (q, q') each: M dq'/h, and dq/h is a velocity that friction, of slope B, would have damped.
   JointVector torque_of(const JointVector& dq, const JointVector& ddq, double h) const noexcept {
@@ -134,10 +133,7 @@ class JointKalman {
     const Cholesky<double> factor(W_, n_);
     const JointVector dv = factor.solve(r);
     JointVector a{};
-    for (int i = 0; i < n_; ++i) {
-      a[u(i)] = dv[u(i)] / h;
-      inertia_[u(i)] = W_(i, i);
-    }
+    for (int i = 0; i < n_; ++i) a[u(i)] = dv[u(i)] / h;
     acceleration_ = a;
 
     // X = -h W^-1 [dtau/dq, dtau/dq' + B + h/2 dtau/dq, D], and N = h W^-1 beside it.
@@ -226,6 +222,19 @@ class JointKalman {
     }
   }
 
+  struct Innovation {
+    double y, s;
+  };
+  /// What measure_joints() would see of joint i's position: innovation and variance.
+  Innovation innovation(const Arm& arm, const JointSample& sample, int i) const noexcept {
+    Innovation out{sample.q[u(i)] - q(i), variance(i) + std::max(arm.position_variance(i), least_variance)};
+    if (encoder_ >= 0) {
+      const int e = 2 * n_ + encoder_ + i;
+      out.y -= x_[u(e)];
+      out.s += 2.0 * covariance(i, e) + variance(e);
+    }
+    return out;
+  }
   /// All of a sample's positions, and its velocities where the arm declares how good they are. `seen(i, e, update)` after
   /// each: it measured state i, plus state e if e >= 0.
   template <class Seen>
@@ -347,7 +356,7 @@ class JointKalman {
   int active_;  // states the dynamics depend on: all but the encoder errors, which come last
   double h_ = 0.0;
   std::array<double, max_dim> x_{}, K_{}, p_{};
-  JointVector theta_{}, slope_{}, acceleration_{}, inertia_{}, rounded_at_{};
+  JointVector theta_{}, slope_{}, acceleration_{}, rounded_at_{};
   JointMatrix W_{};
   Parameters decay_{};
   Matrix P_{}, T_{};

@@ -88,14 +88,19 @@ class PayloadFilter {
     }
     const int steps = 1 + static_cast<int>(s.dt / config_.max_step);
     for (int k = 0; k < steps; ++k) predict(s, s.dt / steps);
+    look_for_breakaway(s);
     const double smoothing = -std::expm1(-s.dt / memory), quick = -std::expm1(-s.dt / 0.03);
     JointVector dq{}, ddq{};  // corrections of (q, q')
+    double correction = 0.0, correction_variance = 0.0;  // of the mass
     filter_.measure_joints(*arm_, s, [&](int i, int e, const Filter::Update& update) {
       if (i < arm_->n()) {
         const double square = std::min(update.y * update.y / update.s, 100.0);
         surprise_[u(i)] += smoothing * (square - surprise_[u(i)]);
         recent_surprise_[u(i)] += quick * (square - recent_surprise_[u(i)]);
       }
+      const double of_mass = update.K[2 * arm_->n()];
+      correction += of_mass * update.y;
+      correction_variance += of_mass * of_mass * update.s;
       for (int j = 0; j < arm_->n(); ++j) {
         dq[u(j)] += update.K[j] * update.y;
         ddq[u(j)] += update.K[arm_->n() + j] * update.y;
@@ -107,6 +112,8 @@ class PayloadFilter {
         for (int r = 0; r < filter_.dim(); ++r) hyp.e[u(r)] -= update.K[r] * seen;
       }
     });
+    const double square = correction_variance > 0.0 ? correction * correction / correction_variance : 0.0;
+    mass_surprise_ += smoothing * (std::min(square, 3.0 / smoothing) - mass_surprise_);  // an outlier is seen, and forgotten again
     if (!filter_.healthy()) {  // start over rather than report what came out of it
       forget_everything();
       begin(s);
@@ -181,7 +188,7 @@ class PayloadFilter {
     double span = 0.0, first = 1.0;                              ///< so far [s]; weight of the first sample
     JointVector torque{};                                        ///< lacking - D theta^ + b^ [N m]
     std::array<std::array<double, 4>, max_joints> lever{};       ///< D
-    JointVector rho{}, white{}, q_variance{};                    ///< the last when it began
+    JointVector rho{}, white{}, bias{}, q_variance{};            ///< bias: variance of b; the last when it began
     JointMatrix dq_covariance{};                                 ///< likewise
     double hidden = 0.0;                                         ///< part of V's diagonal that the learnt model error makes
   };
@@ -196,6 +203,7 @@ class PayloadFilter {
   }
   void forget_everything() noexcept {
     surprise_.fill(1.0);
+    mass_surprise_ = 1.0;
     recent_surprise_.fill(1.0);
     hidden_variance_ = unexplained_time_ = 0.0;
     doubt_.fill(0.0);
@@ -286,11 +294,29 @@ class PayloadFilter {
         for (int i = 0; i <= last; ++i) D[i * stride + p] = column[u(i)];
       }
     });
-    for (int i = 0; i < biases_; ++i)
-      filter_.add_parameter_variance(loads_ + i, (1.0 - phi * phi) * bias_variance(i));
+    for (int i = 0; i < biases_; ++i) {
+      bias_variance_[u(i)] = bias_variance(i);
+      filter_.add_parameter_variance(loads_ + i, (1.0 - phi * phi) * bias_variance_[u(i)]);
+    }
     for (Hypothesis& hyp : hypotheses_) {
       filter_.propagate(hyp.e);
       hyp.age += h;
+    }
+  }
+
+  /// A joint at rest that moves as b would not let it: its stiction broke, within the last step. b is drawn anew then, before the
+  /// surprise is taken for a load.
+  void look_for_breakaway(const JointSample& s) noexcept {
+    for (int i = 0; i < biases_; ++i) {
+      if (!regime_.at_rest(i)) continue;
+      const Filter::Innovation seen = filter_.innovation(*arm_, s, i);
+      if (seen.y * seen.y < breakaway * breakaway * seen.s) continue;
+      const double b = filter_.parameter(loads_ + i);
+      std::array<double, Filter::max_dim> e{};  // what a unit jump of b at the start of the step has left by now
+      e[u(2 * arm_->n() + loads_ + i)] = 1.0;
+      filter_.propagate(e);
+      filter_.set_parameter(loads_ + i, b, 0.0);
+      filter_.add_direction(e, -b, bias_variance_[u(i)]);
     }
   }
 
@@ -313,7 +339,7 @@ class PayloadFilter {
   void restart(Window& w) noexcept {
     w.span = 0.0;
     w.first = 1.0;
-    w.torque = w.white = w.rho = {};
+    w.torque = w.white = w.bias = w.rho = {};
     w.lever = {};
     for (int i = 0; i < arm_->n(); ++i) {
       w.q_variance[u(i)] = filter_.variance(i);
@@ -379,6 +405,7 @@ class PayloadFilter {
       w.torque[u(i)] += a * (torque - w.torque[u(i)]);
       w.rho[u(i)] = w.torque[u(i)] + expected;
       w.white[u(i)] = (1.0 - a) * (1.0 - a) * w.white[u(i)] + a * a * noise_[u(i)];
+      w.bias[u(i)] += a * (bias_variance_[u(i)] - w.bias[u(i)]);
     }
   }
   /// V, the lower triangle.
@@ -407,7 +434,7 @@ class PayloadFilter {
         for (int l = 0; l < loads_; ++l) DP[u(k)] += w.lever[u(i)][u(l)] * filter_.covariance(2 * n + l, 2 * n + k);
       for (int j = 0; j <= i; ++j)
         for (int k = 0; k < loads_; ++k) V(i, j) += DP[u(k)] * w.lever[u(j)][u(k)];
-      V(i, i) += w.white[u(i)] + friction + (biases_ > 0 ? bias_variance(i) : 0.0);
+      V(i, i) += w.white[u(i)] + friction + w.bias[u(i)];
     }
     return V;
   }
@@ -448,6 +475,8 @@ class PayloadFilter {
   bool explained() const noexcept {
     return std::all_of(surprise_.begin(), surprise_.begin() + arm_->n(), [](double s) { return s < 2.0; });
   }
+  /// Whether the mass is corrected no more than is expected: a joint that tells nothing of it may do what it likes.
+  bool settled() const noexcept { return mass_surprise_ < 2.0; }
   /// Mean surprise of the joints, at least 1.
   double surprise() const noexcept {
     double sum = 0.0;
@@ -483,6 +512,7 @@ class PayloadFilter {
       }
     }
     most_share_ = 0.0;
+    const JointMatrix& W = filter_.mass();
     const Mat3<double> R = P.R * arm_->R_last_tip();
     const std::array<Vec3<double>, 3> tip{R.cx, R.cy, R.cz};
     for (int i = 0; i < arm_->n(); ++i) {
@@ -490,7 +520,7 @@ class PayloadFilter {
       lever_[u(i)][0] = torque;
       if (!arm_->body(i).prismatic)
         for (int k = 1; k < loads_; ++k) lever_[u(i)][u(k)] = dot(cross(P.axis[u(i)], tip[u(k - 1)]), a_c - g);
-      const double share = dot(J[u(i)], J[u(i)]) / std::max(filter_.inertia()[u(i)], 1e-12);
+      const double share = dot(J[u(i)], J[u(i)]) / std::max(W(i, i), 1e-12);
       most_share_ = std::max(most_share_, share);
       variance[u(i)] += samples * mass_variance * torque * torque * std::min(1.0, mass_variance * share * share);
       const double turning = arm_->body(i).prismatic ? 0.0 : own_inertia * dot(P.axis[u(i)], spin);
@@ -571,7 +601,7 @@ class PayloadFilter {
     out.status = status;
     const bool sure = out.mass_std <= std::max(config_.ok_relative * std::abs(out.mass), config_.ok_absolute);
     const bool possible = out.mass >= -std::max(3.0 * out.mass_std, config_.ok_absolute);
-    if (status == Status::ok && !(sure && possible && explained() && now_.span >= least_span)) out.status = Status::warming;
+    if (status == Status::ok && !(sure && possible && settled() && now_.span >= least_span)) out.status = Status::warming;
     return out;
   }
 
@@ -584,6 +614,7 @@ class PayloadFilter {
   static constexpr double least_model_error = 1e-6;  // [N^2 m^2]
   static constexpr double memory = 0.3;              // over which surprise and unexplained torque are averaged [s]
   JointVector tau_{}, torque_variance_{}, surprise_{}, recent_surprise_{}, model_error_{};
+  JointVector bias_variance_{};                       // of b in the last prediction, 0 without [N^2 m^2]
   JointVector noise_{};                               // of the torque without the model error, per step [N^2 m^2]
   std::array<std::array<double, 4>, max_joints> lever_{};  // torque per parameter of the load
   JointVector lacking_{};                             // over 0.03 s [N m]
@@ -597,9 +628,11 @@ class PayloadFilter {
   static constexpr double lasting = 0.3;              // a doubt that stays for so long [s] is as certain
   double lately_evidence_ = 0.0;                      // such, at the last test
   double doubtful_time_ = 0.0;                        // for so long it has been [s]
+  double mass_surprise_ = 1.0;                        // squared correction of the mass over its variance
   bool unlike_ = false;                               // something else than a load has certainly been felt
   Filter::Parameters decay_{};
   static constexpr double presliding = 5e-3;  // [rad]
+  static constexpr double breakaway = 5.0;    // standard deviations by which a joint at rest may surprise
   static constexpr double lag = 0.1;          // errors of linearisation last about so long [s]
   static constexpr double known_after = 0.3;  // [s]
   detail::Regime regime_{presliding};
