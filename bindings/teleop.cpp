@@ -23,11 +23,12 @@ nb::dict message(const Message& m, int n) {
   out["booked"] = m.booked;
   out["level"] = m.level;
   out["engaged"] = m.engaged;
+  out["shown"] = m.shown;
   return out;
 }
 Message message(std::uint64_t session, std::uint64_t sequence, std::int64_t time_ns, const Vector& position, const Vector& velocity, const Vector& force, double energy,
-                double booked, double level, bool engaged, int n) {
-  return {session, sequence, time_ns, joints(position, n, "position"), joints(velocity, n, "velocity"), joints(force, n, "force"), energy, booked, level, engaged};
+                double booked, double level, bool engaged, std::uint16_t shown, int n) {
+  return {session, sequence, time_ns, joints(position, n, "position"), joints(velocity, n, "velocity"), joints(force, n, "force"), energy, booked, level, engaged, shown};
 }
 nb::dict tank(const EnergyTank& t) {
   nb::dict out;
@@ -61,10 +62,10 @@ struct PySlave {
 template <class Py>
 void bind_side(nb::class_<Py>& type) {
   type.def("receive", [](Py& self, std::uint64_t session, std::uint64_t sequence, std::int64_t time_ns, const Vector& position, const Vector& velocity, const Vector& force,
-                         double energy, double booked, double level, bool engaged) {
-        return self.side.receive(message(session, sequence, time_ns, position, velocity, force, energy, booked, level, engaged, self.n));
+                         double energy, double booked, double level, bool engaged, std::uint16_t shown) {
+        return self.side.receive(message(session, sequence, time_ns, position, velocity, force, energy, booked, level, engaged, shown, self.n));
       }, nb::arg("session"), nb::arg("sequence"), nb::arg("time_ns"), nb::arg("position"), nb::arg("velocity"), nb::arg("force"), nb::arg("energy"), nb::arg("booked"), nb::arg("level"),
-           nb::arg("engaged"), "A message of the other side, as it came; False: old or broken, not used.")
+           nb::arg("engaged"), nb::arg("shown"), "A message of the other side, as it came; False: old or broken, not used.")
       .def("message", [](const Py& self) { return message(self.side.message(), self.n); }, "To be sent after each step.")
       .def("begin", [](Py& self, std::uint64_t session) { self.side.begin(session); }, nb::arg("session"))
       .def("tank", [](const Py& self) { return tank(self.side.tank()); })
@@ -77,6 +78,7 @@ nb::dict plain(const EpisodeConfig& c) {
   nb::dict out;
   out["coupling"] = std::array<const char*, 3>{"force_position", "position_position", "four_channel"}[static_cast<std::size_t>(c.coupling)];
   out["axes"] = c.axes;
+  out["pose"] = c.pose;
   out["seconds"] = c.seconds;
   out["delay"] = c.delay;
   out["jitter"] = c.jitter;
@@ -114,6 +116,7 @@ void step_times(std::size_t calls, double* master_s, double* slave_s) {
   MasterConfig mc;
   SlaveConfig sc;
   mc.coupling = sc.coupling = Coupling::four_channel;
+  mc.pose = sc.pose = true;
   mc.force_limit.fill(8.5);
   mc.stiffness.fill(300.0);
   mc.damping.fill(5.0);
@@ -171,11 +174,13 @@ void bind_teleop(nb::module_& m) {
                            {"ramp", &LinkConfig::ramp, "from nothing to fully coupled [s]"}});
   bind_config<MasterConfig>(m, "MasterOptions", "The master's side, one number per axis of the device.",
                             {{"passive", &MasterConfig::passive, "the passivity layer; False only to see what happens without"},
-                             {"force_limit", &MasterConfig::force_limit, "largest force of the device [N]"},
+                             {"pose", &MasterConfig::pose, "axes 0 to 2 are a place, 3 to 5 an orientation"},
+                             {"force_limit", &MasterConfig::force_limit, "largest force of the device [N]; 0: measured, no motor"},
                              {"stiffness", &MasterConfig::stiffness, "of the spring between the two [N/m]; not used by force_position"},
                              {"damping", &MasterConfig::damping, "and of the damper [N s/m]"},
                              {"fill", &MasterConfig::fill, "damping felt while the tank is empty [N s/m]"},
-                             {"contact_damping", &MasterConfig::contact_damping, "damping in contact, whole from 1 N felt on [N s/m]"},
+                             {"contact_damping", &MasterConfig::contact_damping, "damping in contact [N s/m]"},
+                             {"contact_force", &MasterConfig::contact_force, "felt, from which on that damping is whole [N]"},
                              {"hold_stiffness", &MasterConfig::hold_stiffness, "spring that holds the device while the link is dead [N/m]"},
                              {"hold_damping", &MasterConfig::hold_damping, "and its damper [N s/m]"},
                              {"acceleration", &MasterConfig::acceleration, "of the device at most [m/s^2]"},
@@ -184,6 +189,9 @@ void bind_teleop(nb::module_& m) {
   bind_config<SlaveConfig>(m, "SlaveOptions", "The slave's side, one number per axis of the slave.",
                            {{"passive", &SlaveConfig::passive, "the passivity layer; False only to see what happens without"},
                             {"task_space", &SlaveConfig::task_space, "the first three axes are a place in space; False: joint to joint"},
+                            {"pose", &SlaveConfig::pose, "and the next three an orientation"},
+                            {"turn_scale", &SlaveConfig::turn_scale, "rotation of the slave per rotation of the master [1]"},
+                            {"turn_limit", &SlaveConfig::turn_limit, "largest angle from the orientation at the start [rad]"},
                             {"motion_scale", &SlaveConfig::motion_scale, "motion of the slave per motion of the master [1]"},
                             {"force_scale", &SlaveConfig::force_scale, "force felt per force of the environment [1]"},
                             {"threshold", &SlaveConfig::threshold, "below so many standard deviations nothing is felt [1]"},
@@ -236,6 +244,34 @@ void bind_teleop(nb::module_& m) {
       }, nb::arg("x"), nb::arg("v"), nb::arg("port"), nb::arg("force"), nb::arg("std"), nb::arg("allowed"), nb::arg("dt"), nb::arg("time_ns"),
            "Returns (reference, its velocity, force to add, felt, events, status).");
   bind_side(slave);
+
+  const auto three = [](const Vector& a, const char* name) {
+    expect(a.shape(0) == 3, std::string(name) + ": expected 3 numbers");
+    return Vec3<double>{a.data()[0], a.data()[1], a.data()[2]};
+  };
+  const auto given = [](const Vec3<double>& a) {
+    Output<double> out({3});
+    out.data[0] = a.x, out.data[1] = a.y, out.data[2] = a.z;
+    return out.array;
+  };
+  m.def("rotation_vector", [given](const Vector& R) {
+    expect(R.shape(0) == 9, "R: expected 9 numbers, row by row");
+    const double* r = R.data();
+    return given(Turn::of({{r[0], r[3], r[6]}, {r[1], r[4], r[7]}, {r[2], r[5], r[8]}}).log());
+  }, nb::arg("R"), "Axis times angle (3,) [rad], angle at most pi, of a rotation matrix (9,), row by row.");
+  m.def("rotation_matrix", [three](const Vector& theta) {
+    const Mat3<double> R = Turn::exp(three(theta, "theta")).matrix();
+    Output<double> out({3, 3});
+    const double rows[9] = {R.cx.x, R.cy.x, R.cz.x, R.cx.y, R.cy.y, R.cz.y, R.cx.z, R.cy.z, R.cz.z};
+    std::copy(rows, rows + 9, out.data);
+    return out.array;
+  }, nb::arg("theta"), "(3, 3) of a rotation vector (3,) [rad].");
+  m.def("turned", [three, given](const Vector& theta, const Vector& d) {
+    return given((Turn::exp(three(d, "d")) * Turn::exp(three(theta, "theta"))).log());
+  }, nb::arg("theta"), nb::arg("d"), "An orientation (3,) turned by d (3,), both rotation vectors in base axes [rad].");
+  m.def("turn_between", [three, given](const Vector& to, const Vector& from) {
+    return given((Turn::exp(three(to, "to")) * Turn::exp(three(from, "from")).inverse()).log());
+  }, nb::arg("to"), nb::arg("from"), "What turns the orientation `from` (3,) to `to` (3,): a rotation vector in base axes [rad].");
 
   m.def("teleop_events", [] {
     nb::dict out;

@@ -4,6 +4,7 @@
 #include <gtest/gtest.h>
 
 #include <limits>
+#include <numbers>
 
 #include "no_alloc.hpp"
 #include "test_arms.hpp"
@@ -303,7 +304,7 @@ TEST(TeleopPair, BrokenInputIsHeldAndSaid) {
 
 TEST(TeleopPair, SaysWhatItExpects) {
   MasterConfig mc = master_config();
-  mc.force_limit[0] = 0.0;
+  mc.force_limit[0] = -1.0;
   EXPECT_THROW(MasterSide(1, mc), std::invalid_argument);
   SlaveConfig sc = slave_config();
   sc.upper[2] = -1.0;
@@ -355,8 +356,325 @@ TEST(TeleopEpisodes, AreTheSameEveryTime) {
   EXPECT_EQ(a.force_jump, b.force_jump);
 }
 
+// --- orientation -----------------------------------------------------------------------------------------------------
+
+constexpr double pi = std::numbers::pi;
+
+Mat3<double> matrix(const Vec3<double>& theta) {  // Rodrigues' formula, written down anew
+  const double a = std::sqrt(dot(theta, theta));
+  if (a == 0.0) return identity3;
+  const Vec3<double> e = (1.0 / a) * theta;
+  const auto column = [&](const Vec3<double>& u) { return std::cos(a) * u + std::sin(a) * cross(e, u) + (1.0 - std::cos(a)) * dot(e, u) * e; };
+  return {column({1, 0, 0}), column({0, 1, 0}), column({0, 0, 1})};
+}
+/// Angle between two orientations [rad], by their matrices: |R_a - R_b|_F = 2 sqrt(2) sin(angle/2).
+double between(const Vec3<double>& a, const Vec3<double>& b) {
+  const Mat3<double> A = matrix(a), B = matrix(b);
+  const Vec3<double> x = A.cx - B.cx, y = A.cy - B.cy, z = A.cz - B.cz;
+  return 2.0 * std::asin(std::min(1.0, std::sqrt((dot(x, x) + dot(y, y) + dot(z, z)) / 8.0)));
+}
+Vec3<double> direction(Random& r) {
+  const Vec3<double> a{r(-1.0, 1.0), r(-1.0, 1.0), r(-1.0, 1.0)};
+  return (1.0 / std::sqrt(dot(a, a))) * a;
+}
+JointVector at(const Vec3<double>& theta) {
+  JointVector out{};
+  Manifold::put(out, theta);
+  return out;
+}
+Vec3<double> turn(const JointVector& x) { return Manifold::turn(x); }
+
+TEST(TeleopPose, SumsAndDifferencesAreThoseOfRotationMatrices) {
+  const Manifold space(6, true);
+  Random r(11);
+  for (int k = 0; k < 2000; ++k) {
+    // every size from none to nearly pi and beyond it
+    const Vec3<double> a = r(0.0, 1.0) * pi * direction(r), d = std::pow(10.0, r(-12.0, 0.49)) * direction(r);
+    const JointVector sum = space.plus(at(a), at(d));
+    const Mat3<double> R = matrix(d) * matrix(a), S = matrix(turn(sum));
+    for (const Vec3<double> e : {R.cx - S.cx, R.cy - S.cy, R.cz - S.cz}) EXPECT_LT(dot(e, e), 1e-29);
+    const Mat3<double> M = Turn::exp(a).matrix(), A = matrix(a);
+    for (const Vec3<double> e : {M.cx - A.cx, M.cy - A.cy, M.cz - A.cz}) EXPECT_LT(dot(e, e), 1e-30);
+    const Vec3<double> again = Turn::of(A).log();
+    EXPECT_LT(dot(again - a, again - a), 1e-28);
+    const Vec3<double> back = turn(space.minus(sum, at(a)));
+    EXPECT_LT(std::sqrt(dot(back - d, back - d)), 4e-15 + 1e-14 * std::sqrt(dot(d, d)));
+    EXPECT_LE(std::sqrt(dot(turn(sum), turn(sum))), pi + 1e-15);
+  }
+  EXPECT_EQ(space.minus(at({0.3, -0.2, 0.1}), at({0.3, -0.2, 0.1}))[3], 0.0);
+}
+
+TEST(TeleopPose, AVelocityIsTheDifferenceOverTimeNearZeroAndNearPi) {
+  // (R(t + h) (-) R(t - h))/2h of a rotation that turns by omega, wherever it is: also where its rotation vector turns over, at pi
+  const Manifold space(6, true);
+  Random r(12);
+  for (const double angle : {0.0, 1e-9, 1e-4, 1.0, pi - 1e-4, pi - 1e-9, pi}) {
+    for (int k = 0; k < 50; ++k) {
+      const Vec3<double> w = r(0.1, 10.0) * direction(r);
+      const JointVector x = at(angle * direction(r));
+      const double h = 1e-4;
+      const Vec3<double> found = (1.0 / (2.0 * h)) * turn(space.minus(space.plus(x, at(h * w)), space.plus(x, at(-h * w))));
+      EXPECT_LT(std::sqrt(dot(found - w, found - w)), 1e-9) << angle;
+      // the energy of a spring K |log|^2/2 falls by its torque's work: torque K log, wherever it is not at pi itself
+      if (angle == pi || angle == pi - 1e-9) continue;
+      const auto energy = [&](double s) {
+        const Vec3<double> theta = turn(space.plus(x, at(s * w)));
+        return 0.5 * dot(theta, theta);
+      };
+      const double step = 1e-6;
+      EXPECT_NEAR((energy(step) - energy(-step)) / (2.0 * step), dot(turn(x), w), 1e-6 * (1.0 + std::sqrt(dot(w, w)))) << angle;
+    }
+  }
+}
+
+TEST(TeleopPose, TheSlaveTurnsAsTheHandFromWhereItWasEngaged) {
+  SlaveConfig sc = slave_config();
+  sc.pose = true;
+  sc.turn_limit = 3.0;
+  sc.rotation = {0, -1, 0, 1, 0, 0, 0, 0, 1};
+  sc.speed = all(6.0);
+  sc.acceleration = all(200.0);
+  MasterConfig mc = master_config();
+  mc.pose = true;
+  Pair pair(6, mc, sc);
+  const Manifold space(6, true);
+  pair.at = at({0.4, 0.3, -2.0});  // the slave stands otherwise than the device, and both are far from zero
+  JointVector x = at({1.0, -2.0, 0.5});
+  const Vec3<double> hand = turn(x), start = turn(pair.at);
+  Random r(13);
+  double worst = 0.0;
+  Vec3<double> w{};
+  for (int k = 0; k < 8000; ++k) {
+    const double t = k * T;
+    w = std::clamp(t - 0.5, 0.0, 1.0) * Vec3<double>{1.5 * std::sin(2.0 * t), 1.2 * std::sin(3.1 * t), 1.3 * std::sin(1.3 * t)};
+    JointVector v{};
+    Manifold::put(v, w);
+    x = space.plus(x, at(T * w));
+    pair.step(x, v);
+    const Vec3<double> turned = turn(space.minus(x, at(hand)));
+    const Vec3<double> wanted = turn(space.plus(at(start), at({-turned.y, turned.x, turned.z})));
+    if (t > 0.5) worst = std::max(worst, between(turn(pair.at), wanted));
+  }
+  EXPECT_LT(worst, 2.3e-3);  // a period at 2.3 rad/s
+  for (int k = 0; k < 300; ++k) pair.step(x, {});
+  const Vec3<double> turned = turn(space.minus(x, at(hand)));
+  EXPECT_GT(std::sqrt(dot(turned, turned)), 0.1);
+  EXPECT_LT(between(turn(pair.at), turn(space.plus(at(start), at({-turned.y, turned.x, turned.z})))), 1e-7);
+}
+
+TEST(TeleopPose, TheClutchLetsTheHandTurnBackWithoutAJump) {
+  SlaveConfig sc = slave_config();
+  sc.pose = true;
+  sc.turn_limit = 3.0;
+  sc.turn_scale = 1.5;
+  sc.speed = all(5.0);
+  sc.acceleration = all(1e3);
+  sc.resync_speed = all(0.5);
+  sc.resync_acceleration = all(4.0);
+  MasterConfig mc = master_config();
+  mc.pose = true;
+  Pair pair(6, mc, sc);
+  const Manifold space(6, true);
+  JointVector x{};
+  for (int stroke = 0; stroke < 3; ++stroke) {
+    for (int k = 0; k < 2500; ++k) {
+      const JointVector before = pair.at;
+      const bool turning = k >= 1500 && k < 2100;
+      const JointVector v = at({turning ? 0.5 : 0.0, 0.0, 0.0});
+      x = space.plus(x, at(T * turn(v)));
+      pair.step(x, v);
+      const JointVector moved = space.minus(pair.at, before);
+      EXPECT_LE(std::abs(moved[3]), 0.9 * T);  // 0.5 rad/s times 1.5, and never a jump
+    }
+    const JointVector held = pair.at;
+    for (int k = 0; k < 500; ++k) {
+      const JointVector v = at({-0.6, 0.4, 0.0});
+      x = space.plus(x, at(T * turn(v)));
+      pair.step(x, v, {}, true, false);
+      EXPECT_EQ(pair.at, held);
+    }
+    for (int k = 0; k < 500; ++k) {
+      x = space.plus(x, at({0.0, -0.4 * T, 0.0}));
+      pair.step(x, {}, {}, true, false);
+    }
+  }
+  EXPECT_NEAR(pair.at[3], 3.0 * 1.5 * 0.3, 0.02);
+  EXPECT_NEAR(pair.at[4], 0.0, 1e-6);
+}
+
+TEST(TeleopPose, TheLargestAngleIsHeldAndFeltAndPointingBeyondPiDoesNotTurnItRound) {
+  SlaveConfig sc = slave_config();
+  sc.pose = true;
+  sc.turn_limit = 1.0;
+  sc.speed = all(2.0);
+  sc.wall = all(5.0);
+  MasterConfig mc = master_config();
+  mc.pose = true;
+  Pair pair(6, mc, sc);
+  const Manifold space(6, true);
+  JointVector x{};
+  const Vec3<double> axis = {0.6, 0.0, 0.8};
+  double most = 0.0, torque = 0.0;
+  for (int k = 0; k < 6000; ++k) {
+    const JointVector v = at((k > 500 && k < 5000 ? 1.0 : 0.0) * axis);  // 4.5 rad in all: beyond pi
+    const Vec3<double> before = turn(pair.at);
+    x = space.plus(x, at(T * turn(v)));
+    pair.step(x, v);
+    const Vec3<double> now = turn(pair.at);
+    most = std::max(most, std::sqrt(dot(now, now)));
+    EXPECT_GE(dot(now - before, axis), -1e-9) << k;  // it never turns back or round
+    if (k == 1800) torque = dot(turn(pair.felt.felt), axis);
+  }
+  EXPECT_NEAR(most, 1.0, 1e-9);
+  EXPECT_NEAR(torque, -5.0 * 0.3, 0.05);
+  EXPECT_NE(pair.command.events & event_workspace, 0);
+  // it is left at once where the hand turns back by what did not slip, half the way from there to pi
+  for (int k = 0; k < 1300; ++k) {
+    const JointVector v = at(-1.0 * axis);
+    x = space.plus(x, at(T * turn(v)));
+    pair.step(x, v);
+  }
+  EXPECT_EQ(pair.command.events & event_workspace, 0);
+  EXPECT_LT(std::sqrt(dot(turn(pair.at), turn(pair.at))), 0.9);
+}
+
+TEST(TeleopPose, TorqueIsFeltByItsOwnThresholdAndScaleAndNotWhereThereIsNoMotor) {
+  SlaveConfig sc = slave_config();
+  sc.pose = true;
+  sc.motion_scale = 2.0;
+  sc.force_scale = 0.5;
+  sc.turn_scale = 1.0;
+  for (const bool motor : {true, false}) {
+    MasterConfig mc = master_config();
+    mc.pose = true;
+    for (std::size_t i = 3; i < 6; ++i) mc.force_limit[i] = motor ? 0.4 : 0.0;
+    MasterSide master(6, mc);
+    SlaveSide slave(6, sc);
+    master.begin(1);
+    slave.begin(1);
+    JointVector wrench{}, std{};
+    wrench[0] = -4.0, wrench[3] = -0.9, wrench[4] = 0.9;
+    std[0] = 0.1, std[3] = 0.1, std[4] = 0.5;
+    MasterCommand felt;
+    for (int k = 0; k < 1500; ++k) {
+      felt = master.step({}, {}, {}, true, T);
+      slave.receive(master.message());
+      slave.step({}, {}, wrench, wrench, std, true, T);
+      master.receive(slave.message());
+    }
+    EXPECT_NEAR(felt.felt[0], -2.0, 1e-9);
+    EXPECT_NEAR(felt.felt[3], motor ? -0.9 * 0.5 * 1.0 / 2.0 : 0.0, 1e-9);  // a force at a lever that is scaled like the motion
+    EXPECT_EQ(felt.felt[4], 0.0);                                           // within its own threshold
+    EXPECT_EQ(felt.events & event_force, 0);                                // no motor is no limit reached
+    EXPECT_EQ(master.message().shown & 0x3F, motor ? 0x3F : 0x07);
+  }
+}
+
+TEST(TeleopPose, WhatShowsNoTorqueAsksNoTank) {
+  // a spring of 2 N m/rad is turned by a whole radian: nobody pays by a gimbal that only measures, and yet it goes
+  for (const bool motor : {true, false}) {
+    SlaveConfig sc = slave_config();
+    sc.pose = true;
+    sc.speed = all(3.0);
+    MasterConfig mc = master_config();
+    mc.pose = true;
+    for (std::size_t i = 3; i < 6; ++i) mc.force_limit[i] = motor ? 0.05 : 0.0;
+    Pair pair(6, mc, sc);
+    const Manifold space(6, true);
+    JointVector x{};
+    for (int k = 0; k < 4000; ++k) {
+      const JointVector v = at({0.0, 0.0, k > 1000 && k < 2000 ? 1.0 : 0.0});
+      x = space.plus(x, at(T * turn(v)));
+      pair.step(x, v, at({0.0, 0.0, -2.0 * pair.at[5]}));
+    }
+    if (motor) EXPECT_LT(pair.at[5], 0.5);  // the hand gave 0.05 J, and no more comes out
+    else EXPECT_NEAR(pair.at[5], x[5], 1e-6);
+    EXPECT_GE(pair.slave.tank().lowest(), 0.0);
+  }
+}
+
+TEST(TeleopPose, HoldsWhenTheLinkDiesAndReturnsWithoutAJump) {
+  SlaveConfig sc = slave_config();
+  sc.pose = true;
+  sc.speed = all(5.0);
+  sc.resync_speed = all(0.5);
+  sc.resync_acceleration = all(2.0);
+  sc.link.ramp = 1.0;
+  MasterConfig mc = master_config();
+  mc.pose = true;
+  mc.link.ramp = 1.0;
+  for (std::size_t i = 3; i < 6; ++i) mc.force_limit[i] = 1.0, mc.hold_stiffness[i] = 2.0, mc.hold_damping[i] = 0.02, mc.resync_rate[i] = 15.0;
+  Pair pair(6, mc, sc);
+  const Manifold space(6, true);
+  JointVector x{}, held{};
+  double torque = 0.0, speed = 0.0;
+  for (int k = 0; k < 9000; ++k) {
+    const bool line = k < 2000 || k >= 5000;
+    const JointVector v = at({k < 5000 && k > 500 ? 0.1 : 0.0, k < 5000 && k > 500 ? 0.15 : 0.0, 0.0});
+    x = space.plus(x, at(T * turn(v)));
+    const double touching = -2.0 * std::max(0.0, pair.at[3] - 0.1);
+    const double before = pair.felt.force[3], w = pair.velocity[4];
+    pair.step(x, v, at({touching, 0.0, 0.0}), line);
+    if (k == 2300) held = pair.at;
+    if (k > 2300 && k < 5000) {
+      EXPECT_EQ(pair.at, held);
+      EXPECT_NE(pair.command.events & event_link, 0);
+      if (k > 3500) EXPECT_LT(pair.felt.force[3], -0.05);  // the device is held where the link died
+    }
+    if (k >= 5000) {
+      torque = std::max(torque, std::abs(pair.felt.force[3] - before));
+      speed = std::max(speed, std::abs(pair.velocity[4] - w));
+    }
+  }
+  EXPECT_LT(torque, 0.02) << "in one period";
+  EXPECT_LT(speed, 0.05);
+  EXPECT_LT(between(turn(pair.at), turn(held)), 0.02);
+}
+
+TEST(TeleopPose, SaysWhatItExpects) {
+  SlaveConfig sc = slave_config();
+  sc.pose = true;
+  EXPECT_THROW(SlaveSide(5, sc), std::invalid_argument);
+  EXPECT_NO_THROW(SlaveSide(6, sc));
+  sc.turn_limit = 3.2;
+  EXPECT_THROW(SlaveSide(6, sc), std::invalid_argument);
+  sc.turn_limit = 1.0;
+  sc.turn_scale = 2.0;
+  sc.resync = Resync::approach;
+  EXPECT_THROW(SlaveSide(6, sc), std::invalid_argument);
+  sc.turn_scale = 1.0;
+  sc.task_space = false;
+  EXPECT_THROW(SlaveSide(6, sc), std::invalid_argument);
+  MasterConfig mc = master_config();
+  mc.pose = true;
+  EXPECT_THROW(MasterSide(3, mc), std::invalid_argument);
+}
+
+TEST(TeleopEpisodes, OfAPoseMakeNoEnergyAndBreakNoLimit) {
+  int shaking = 0;
+  for (std::uint64_t seed = 0; seed < 20; ++seed) {
+    EpisodeConfig c = random_episode(seed);
+    c.pose = true;
+    const EpisodeResult r = run_episode(c, seed);
+    EXPECT_LE(r.generated, 2.0 * c.tank.initial) << seed;
+    EXPECT_GE(r.lowest, 0.0) << seed;
+    EXPECT_LE(r.force, c.force_limit * (1.0 + 1e-12)) << seed;
+    EXPECT_LE(r.speed, c.speed * (1.0 + 1e-9)) << seed;
+    EXPECT_LE(r.force_jump, 2.0) << seed;
+    EXPECT_EQ(r.hold_motion, 0.0) << seed;
+    EXPECT_TRUE(r.finite) << seed;
+    if (seed >= 6) continue;
+    c.layer = Layer::none;
+    shaking += run_episode(c, seed).generated > 0.1;
+  }
+  EXPECT_GT(shaking, 2);  // the same without the layer
+}
+
 TEST(TeleopPair, AStepAllocatesNothing) {
-  Pair pair(6, master_config(Coupling::four_channel), slave_config(Coupling::four_channel));
+  MasterConfig mc = master_config(Coupling::four_channel);
+  SlaveConfig sc = slave_config(Coupling::four_channel);
+  mc.pose = sc.pose = true;
+  Pair pair(6, mc, sc);
   palpate::test::AllocationCounter counter;
   for (int k = 0; k < 100; ++k) pair.step(all(1e-4 * k), all(0.1), all(-1.0));
   EXPECT_EQ(counter.count(), 0u);

@@ -281,7 +281,7 @@ def test_two_processes_meet() -> None:
 
 def test_the_packet_says_what_the_module_says() -> None:
     packet = Sealer(KEY, "slave", 1, 3).seal(message(1), 0)
-    assert packet[:4] == b"PT\x02\x02" and len(packet) == 28 + 58 + 72 + 16
+    assert packet[:4] == b"PT\x03\x02" and len(packet) == 28 + 60 + 72 + 16
     assert module.LONGEST >= len(Sealer(KEY, "slave", 1, 16).seal(message(1, n=16), 0))
 
 

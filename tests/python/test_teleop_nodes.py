@@ -149,9 +149,9 @@ class Pair:
     ) -> None:
         shared = Shared(session=None)
         follower, side, _, _ = build_slave(None, shared=shared)
-        there = UdpChannel(KEY, "slave", 3, clock=lambda: time.time_ns() + ahead_ns)
+        there = UdpChannel(KEY, "slave", 6, clock=lambda: time.time_ns() + ahead_ns)
         held = HapticDevice(Hand()) if device is None else device
-        here = UdpChannel(KEY, "master", 3, peer=there.address)
+        here = UdpChannel(KEY, "master", 6, peer=there.address)
         names = (None, None) if record is None else (record / "master.mcap", record / "slave.mcap")
         self.said: list[str] = []
         self.master = Node(

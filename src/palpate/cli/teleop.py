@@ -77,7 +77,9 @@ _Record = Annotated[
 ]
 _Scene = Annotated[
     str,
-    typer.Argument(metavar="[SCENE]", help="wall, rigid, surface, peg, lift or free.", show_default=False),
+    typer.Argument(
+        metavar="[SCENE]", help="wall, rigid, surface, peg, lift, turn or free.", show_default=False
+    ),
 ]
 _Arm = Annotated[
     str,
@@ -137,7 +139,8 @@ def add(app: typer.Typer) -> None:
         "run",
         help="Both sides in one process.\n\n"
         "Scenes: wall (press a spring of known stiffness), rigid (a wall that gives no way), "
-        "surface (trace it), peg (into a hole), lift (objects whose masses nobody knows), free (nothing to touch). "
+        "surface (trace it), peg (into a hole), lift (objects whose masses nobody knows), turn (a valve on a spring "
+        "by a key), free (nothing to touch). "
         "Delay, jitter, loss and dead links come from a fault layer; every message is encrypted and authenticated.",
         epilog=examples(
             "palpate teleop run",
@@ -243,7 +246,7 @@ def slave(
     if scene == "lift":
         raise InputError("the objects of lift come by a script of both sides: palpate teleop run lift")
     faults = _faults(delay, jitter, loss, duplicate)
-    channel = UdpChannel(read_key(key), "slave", 3, local=_address("--bind", bind), faults=faults, seed=seed)
+    channel = UdpChannel(read_key(key), "slave", 6, local=_address("--bind", bind), faults=faults, seed=seed)
     shared = Shared(_coupling(coupling), passivity, session=None)
     follower, side, _, _ = build_slave(
         None if scene == "free" else scene,
@@ -268,7 +271,9 @@ def master(
     ] = "hand",
     script: Annotated[
         str,
-        typer.Option(metavar="SCENE", help="What the simulated hand does: wall, rigid, surface, peg, free."),
+        typer.Option(
+            metavar="SCENE", help="What the simulated hand does: wall, rigid, surface, peg, turn, free."
+        ),
     ] = "wall",
     bind: Annotated[
         str | None,
@@ -303,7 +308,7 @@ def master(
     here = peer[0] in ("127.0.0.1", "localhost")
     local = _address("--bind", bind) if bind is not None else ("127.0.0.1" if here else "0.0.0.0", 0)
     faults = _faults(delay, jitter, loss, duplicate)
-    channel = UdpChannel(read_key(key), "master", 3, local=local, peer=peer, faults=faults, seed=seed)
+    channel = UdpChannel(read_key(key), "master", 6, local=local, peer=peer, faults=faults, seed=seed)
     shared = Shared(_coupling(coupling), passivity, session=None)
     with ExitStack() as stack:
         held: Device
@@ -398,6 +403,15 @@ def run(
     ] = None,
     motion_scale: _MotionScale = None,
     force_scale: _ForceScale = None,
+    torque: Annotated[
+        float | None,
+        typer.Option(
+            metavar="NM",
+            help="Largest torque of the device; 0: its gimbal is measured and has no motors. [default: 0.5 in turn, "
+            "else 0]",
+            show_default=False,
+        ),
+    ] = None,
     delay: _Delay = 0.0,
     jitter: _Jitter = 0.0,
     loss: _Loss = 0.0,
@@ -454,6 +468,7 @@ def run(
         masses=tuple(mass) if mass else None,
         motion_scale=motion_scale,
         force_scale=force_scale,
+        torque_limit=torque,
         passive=passivity,
         seed=seed,
     )

@@ -3,8 +3,8 @@
 A packet is a header in the clear and a body sealed with ChaCha20-Poly1305 (RFC 8439), whose tag covers both::
 
     "PT"  version u8  role u8 | salt 8 bytes | session u64 | sequence u64 | sealed body | tag 16 bytes
-    body: echo 8 bytes | time i64 | echo_time i64 | echo_age i64 | n u8 | flags u8 | energy, booked, level f64
-          | 3 n f64 | reason
+    body: echo 8 bytes | time i64 | echo_time i64 | echo_age i64 | n u8 | flags u8 | shown u16
+          | energy, booked, level f64 | 3 n f64 | reason
 
 The key of a direction in a run is HKDF-SHA256(shared key, salt, role), so a sequence number, which is the nonce,
 never meets a key
@@ -35,7 +35,7 @@ import numpy as np
 from ..arm import Array
 from ..errors import InputError, MissingExtraError, PalpateError
 
-VERSION = 2
+VERSION = 3
 """of the packets; a side with another one is refused"""
 MAX_CLOCK_OFFSET = 30.0
 """clocks further apart than this are refused [s]: the recording of both sides would make no sense"""
@@ -45,7 +45,7 @@ WINDOW = 1024
 Role: TypeAlias = Literal["master", "slave"]
 
 _HEADER = struct.Struct(">2sBB8sQQ")
-_BODY = struct.Struct(">8sqqqBBddd")
+_BODY = struct.Struct(">8sqqqBBHddd")
 _TAG = 16
 _NOBODY = bytes(8)
 _SILENCE_NS = 1_000_000_000
@@ -85,6 +85,8 @@ class Message:
     """the sender wants to be coupled"""
     reason: str = ""
     """what holds the sender or slows it down, for people; cut at 120 bytes"""
+    shown: int = 0xFFFF
+    """bit i: the sender's axis i has a motor"""
 
 
 # --- keys -------------------------------------------------------------------------------------------------------------
@@ -231,6 +233,7 @@ class Sealer:
             echo_age,
             self.n,
             int(message.engaged),
+            message.shown,
             message.energy,
             message.booked,
             message.level,
@@ -264,7 +267,9 @@ class Sealer:
             )
         if len(body) < _BODY.size:
             return self._refused("length", f"a body of {len(body)} bytes")
-        echo, sent_ns, echo_time, echo_age, n, flags, energy, booked, level = _BODY.unpack(body[: _BODY.size])
+        echo, sent_ns, echo_time, echo_age, n, flags, shown, energy, booked, level = _BODY.unpack(
+            body[: _BODY.size]
+        )
         end = _BODY.size + 24 * n
         if n != self.n or not end <= len(body) <= end + _MOST_WORDS:
             return self._refused("axes", f"the other side has {n} axes, this one {self.n}")
@@ -308,6 +313,7 @@ class Sealer:
             level,
             bool(flags & 1),
             "".join(c for c in body[end:].decode(errors="ignore") if c.isprintable()),
+            shown,
         )
 
     def _cipher(self, salt: bytes) -> Any:

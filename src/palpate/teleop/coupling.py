@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from enum import IntFlag
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -22,6 +23,11 @@ CouplingName: TypeAlias = Literal["force_position", "position_position", "four_c
 COUPLINGS: tuple[CouplingName, ...] = ("force_position", "position_position", "four_channel")
 
 
+LEVER = 0.1
+"""of a pose, where one number is given for all axes [m]: it is that of the place, and the orientation has what is alike
+at such a lever (torque 0.1 times the force, stiffness 0.01 times, speed 10 times)"""
+
+
 class Event(IntFlag):
     """What is the matter; 0 where everything is as wanted."""
 
@@ -38,7 +44,7 @@ class Event(IntFlag):
     SPEED = 32
     """the reference is at its largest speed"""
     WORKSPACE = 64
-    """the master points out of what the slave may reach"""
+    """the master points out of what the slave may reach, or turns beyond its largest angle"""
     INPUT = 128
     """a number was not finite: the last good ones hold"""
 
@@ -121,9 +127,12 @@ class _Side:
         return dict(self._core.tank())
 
 
-def _full(value: npt.ArrayLike, n: int, what: str) -> list[float]:
+def _full(value: npt.ArrayLike, n: int, what: str, pose: bool, power: int) -> list[float]:
+    """One number per axis; `power` of the lever, by which a number for the place is one for the orientation."""
     try:
         array = np.asarray(value, dtype=np.float64)
+        if array.shape == () and pose:
+            array = np.array([float(array) * (LEVER**power if 3 <= i < 6 else 1.0) for i in range(n)])
         return [float(x) for x in np.broadcast_to(array, (n,))]
     except (TypeError, ValueError):
         raise InputError(f"{what}: expected one number or {n}, got {value!r:.60}") from None
@@ -135,12 +144,16 @@ class MasterSide(_Side):
 
     Args:
         n: axes of the device, 1 to 16.
-        force_limit: largest force of the device [N], one number or one per axis; so are the others.
+        force_limit: largest force of the device [N], one number or one per axis; so are the others. 0: the axis is
+            measured and has no motor.
+        pose: axes 0 to 2 are a place, 3 to 5 an orientation: its rotation vector [rad], angular velocity [rad/s] and
+            torque [N m] in base axes. One number is then of the place, see :data:`LEVER`.
         coupling: "force_position" (as published), "position_position" or "four_channel".
         stiffness: of the spring between the two [N/m]; not used by force_position.
         damping: and of the damper [N s/m].
         fill: damping while the tank is empty [N s/m].
-        contact_damping: damping in contact, whole from 1 N felt on: it makes up for the estimate's delay [N s/m].
+        contact_damping: damping in contact: it makes up for the estimate's delay [N s/m].
+        contact_force: felt, from which on that damping is whole [N].
         hold_stiffness: of the spring that holds the device while the link is dead [N/m].
         hold_damping: and of its damper [N s/m].
         acceleration: of the device at most [m/s^2]; larger is safer, and needs a fuller tank.
@@ -160,11 +173,13 @@ class MasterSide(_Side):
         n: int,
         force_limit: npt.ArrayLike,
         *,
+        pose: bool = False,
         coupling: CouplingName = "force_position",
         stiffness: npt.ArrayLike = 300.0,
         damping: npt.ArrayLike = 5.0,
         fill: npt.ArrayLike = 1.0,
         contact_damping: npt.ArrayLike = 0.0,
+        contact_force: npt.ArrayLike = 1.0,
         hold_stiffness: npt.ArrayLike = 200.0,
         hold_damping: npt.ArrayLike = 2.0,
         acceleration: npt.ArrayLike = 50.0,
@@ -176,19 +191,23 @@ class MasterSide(_Side):
         session: int | None = None,
     ) -> None:
         vectors = {
-            "force_limit": force_limit,
-            "stiffness": stiffness,
-            "damping": damping,
-            "fill": fill,
-            "contact_damping": contact_damping,
-            "hold_stiffness": hold_stiffness,
-            "hold_damping": hold_damping,
-            "acceleration": acceleration,
-            "resync_rate": resync_rate,
+            "force_limit": (force_limit, 1),
+            "stiffness": (stiffness, 2),
+            "damping": (damping, 2),
+            "fill": (fill, 2),
+            "contact_damping": (contact_damping, 2),
+            "contact_force": (contact_force, 1),
+            "hold_stiffness": (hold_stiffness, 2),
+            "hold_damping": (hold_damping, 2),
+            "acceleration": (acceleration, -1),
+            "resync_rate": (resync_rate, 1),
         }
         try:
             options = MasterOptions(
-                passive=passive, fade=fade, **{k: _full(v, n, k) for k, v in vectors.items()}
+                passive=passive,
+                pose=pose,
+                fade=fade,
+                **{k: _full(v, n, k, pose, power) for k, (v, power) in vectors.items()},
             )
             self._core = CoreMaster(n, options, coupling, link or LinkOptions(), tank or TankOptions())
         except ValueError as error:
@@ -220,15 +239,20 @@ class SlaveSide(_Side):
     (docs/theory.md).
 
     Args:
-        n: axes of the slave, 3 to 16 in task space, 1 to 16 joint to joint.
+        n: axes of the slave, 3 to 16 in task space (6 with an orientation), 1 to 16 joint to joint.
         speed: of the reference at most [m/s], one number or one per axis; so are the others.
         lower: where the reference may be [m].
         upper: [m].
         force_limit: largest force that is told or fed forward [N].
         coupling: as the master's.
         task_space: the first three axes are a place in space, turned by `rotation`; False: joint to joint.
+        pose: axes 3 to 5 are an orientation, turned by it too: a rotation vector [rad] in base axes, see
+            :class:`MasterSide`. `lower` and `upper` are of the place, (3,) or one number per axis.
         rotation: (3, 3) R_slave_master.
         motion_scale: motion of the slave per motion of the master [1].
+        turn_scale: rotation of the slave per rotation of the master [1]. Torques are scaled by
+            force_scale turn_scale/motion_scale, as a force at a lever that is scaled like the motion.
+        turn_limit: largest angle of the reference from the orientation at the start [rad], at most 3.
         force_scale: force felt per force of the environment [1].
         threshold: below so many standard deviations nothing is felt [1].
         acceleration: of the reference at most [m/s^2].
@@ -262,8 +286,11 @@ class SlaveSide(_Side):
         force_limit: npt.ArrayLike,
         coupling: CouplingName = "force_position",
         task_space: bool = True,
+        pose: bool = False,
         rotation: npt.ArrayLike | None = None,
         motion_scale: float = 1.0,
+        turn_scale: float = 1.0,
+        turn_limit: float = 1.5,
         force_scale: float = 1.0,
         threshold: float = 3.0,
         acceleration: npt.ArrayLike = 20.0,
@@ -282,27 +309,34 @@ class SlaveSide(_Side):
         R = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
         if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0.0:
             raise InputError(f"rotation: expected a rotation matrix (3, 3), got {R.tolist()}")
+        if pose and np.shape(lower) == np.shape(upper) == (3,) and n > 3:
+            rest = np.zeros(n - 3)
+            rest[3:] = math.inf
+            lower, upper = np.concatenate((lower, -rest)), np.concatenate((upper, rest))
         vectors = {
-            "lower": lower,
-            "upper": upper,
-            "speed": speed,
-            "acceleration": acceleration,
-            "resync_speed": resync_speed,
-            "resync_acceleration": resync_acceleration,
-            "stiffness": stiffness,
-            "wall": wall,
-            "force_limit": force_limit,
+            "lower": (lower, 0),
+            "upper": (upper, 0),
+            "speed": (speed, -1),
+            "acceleration": (acceleration, -1),
+            "resync_speed": (resync_speed, -1),
+            "resync_acceleration": (resync_acceleration, -1),
+            "stiffness": (stiffness, 2),
+            "wall": (wall, 2),
+            "force_limit": (force_limit, 1),
         }
         try:
             options = SlaveOptions(
                 passive=passive,
                 task_space=task_space,
+                pose=pose,
+                turn_scale=turn_scale,
+                turn_limit=turn_limit,
                 motion_scale=motion_scale,
                 force_scale=force_scale,
                 threshold=threshold,
                 gain=gain,
                 velocity_time=velocity_time,
-                **{k: _full(v, n, k) for k, v in vectors.items()},
+                **{k: _full(v, n, k, pose, power) for k, (v, power) in vectors.items()},
             )
             self._core = CoreSlave(
                 n,
@@ -319,6 +353,8 @@ class SlaveSide(_Side):
         """of what is felt, in standard deviations [1]"""
         self.force_scale = force_scale
         """force felt per force of the environment [1]"""
+        self.torque_scale = force_scale * turn_scale / motion_scale
+        """torque felt per torque of the environment [1]"""
         super().__init__(n, session)
 
     def step(

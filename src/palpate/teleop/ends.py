@@ -21,7 +21,8 @@ equal, and a hand's own will is slower"""
 
 
 class MasterEnd:
-    """A device and what the hand that holds it feels.
+    """A device and what the hand that holds it feels. A device of fewer axes than its side keeps the others at zero:
+    one that knows no orientation leaves that of the slave.
 
     Args:
         device: held by its hand.
@@ -35,11 +36,16 @@ class MasterEnd:
         self.reason = ""
         """what holds it; empty: nothing does"""
         self._hand = np.zeros(side.n)
+        self._axes = side.n
 
     def step(self, now_ns: int) -> MasterCommand:
         """One period; a device that is gone opens the clutch, and says so."""
+        axes, n = self._axes, self.side.n
         try:
-            self.x, self.v = self.device.read()
+            x, v = self.device.read()
+            axes = self._axes = min(len(x), n)
+            self.x, self.v = np.zeros(n), np.zeros(n)
+            self.x[:axes], self.v[:axes] = x[:axes], v[:axes]
             gone = ""
         except DriverError as error:
             self.v, gone = np.zeros(self.side.n), f"device: {error}"
@@ -47,7 +53,7 @@ class MasterEnd:
         command = self.side.step(self.x, self.v, PERIOD, now_ns, hand=self._hand, closed=closed)
         self._hand = self._hand - math.expm1(-HAND * PERIOD) * (-command.force - self._hand)
         if not gone:
-            self.device.step(command.force, PERIOD)
+            self.device.step(command.force[:axes], PERIOD)
         self.reason = gone or (
             "a reading of the device is not a number" if command.events & Event.INPUT else ""
         )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .._core import turn_between
 from .coupling import Event
 from .ends import PERIOD
 from .session import Cut, Run
@@ -16,6 +17,8 @@ SETTLED = 2.0
 """the coupling is whole and the tare taken from here on [s]"""
 _TOUCH = 0.3
 """a true force above it is a touch [N]"""
+_TWIST = 0.05
+"""and a true torque [N m]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,3 +137,61 @@ def jumps(run: Run, cuts: tuple[Cut, ...]) -> tuple[float, float, float]:
                 speed, float(np.abs(run.tip_velocity[later] - run.tip_velocity[before]).max(initial=0.0))
             )
     return force, speed, moved
+
+
+@dataclass(frozen=True, slots=True)
+class Turning:
+    """The same of orientation and torque. NaN: the run does not tell."""
+
+    tracking: float
+    """largest angle of the tool from where the device turns it, with nothing touched [rad]"""
+    spin: float
+    """of the tool there, largest angular velocity [rad/s]"""
+    torque: float
+    """largest true torque about the tool's tip [N m]"""
+    estimate_error: float
+    """mean of the estimated less the true torque, while it is touched [N m]"""
+    torque_error: float
+    """mean of felt against true torque where it is held, part of the true torque [1]; NaN: the device shows none"""
+    torque_held: float
+    """the true torque there [N m]"""
+
+
+def turning(run: Run, *, torque_scale: float = 1.0) -> Turning:
+    """Figures of a run whose pose is coupled.
+
+    Args:
+        run: the run.
+        torque_scale: torque felt per torque of the environment [1].
+    """
+    begin = round(SETTLED / PERIOD)
+    touched = np.linalg.norm(run.true, axis=1) > _TOUCH
+    torque, spin = np.linalg.norm(run.true_torque, axis=1), np.linalg.norm(run.tip_spin, axis=1)
+    touched |= torque > _TWIST
+    free = ~(np.convolve(touched, np.ones(601), mode="same") > 0.0)
+    free[:begin] = False
+    alone = np.flatnonzero(free)
+    away = [float(np.linalg.norm(turn_between(run.wanted_turn[k], run.tip_turn[k]))) for k in alone]
+    error = np.linalg.norm(run.estimated_torque - run.true_torque, axis=1)
+    torque_error = held = math.nan
+    late = touched.copy()
+    late[:begin] = False
+    still = np.flatnonzero(late & (spin < 0.03) & (torque > 0.7 * torque.max()))
+    if len(still) > 100 and np.any(run.felt_torque):
+        direction = run.true_torque[still].mean(axis=0)
+        held = float(np.linalg.norm(direction))
+        direction /= held
+        count = len(still) // 100 * 100
+        felt, really = (
+            (part[still] @ direction)[:count].reshape(-1, 100).mean(axis=1)
+            for part in (run.felt_torque / torque_scale, run.true_torque)
+        )
+        torque_error = float(np.abs(felt / really - 1.0).mean())
+    return Turning(
+        max(away, default=math.nan),
+        float(spin[alone].max(initial=0.0)),
+        float(torque.max(initial=0.0)),
+        float(error[late].mean()) if late.any() else math.nan,
+        torque_error,
+        held,
+    )

@@ -13,6 +13,7 @@ from ..logs import Sample
 from ..simulate.drives import GearedPlant, position_gains
 from ..simulate.irb2400 import CurrentSensors, PhaseSensors, truth_drives
 from .motor_force import MotorForce, identified
+from .pose import pose_minus, pose_of, pose_plus
 from .slaves import InScene, Seen
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ TRACKER = 80.0
 """bandwidth with which the robot's controller smooths the reference it is given [rad/s]"""
 PLAY = 3e-4
 """so far the hand may move before the reference does, or its tremor would turn the motors back all the time [m]"""
+PLAY_TURN = 5e-4
+"""and turn [rad]"""
 CERTAIN = 6.0
 """a force of so many standard deviations is a touch, until it is less than half as many of sliding friction [1]"""
 SENSORS = 11
@@ -62,8 +65,8 @@ class IndustrialSlave(InScene):
         self._estimator = MotorForce(arm, identified(arm.name), period=sensors.period_ns * 1e-9)
         driver = MujocoDriver(plant, sensor=sensors, q=q)
         super().__init__(driver, scene, model=arm)
-        self._goal = self.x.copy()
-        self._x, self._v, self._a = self.x.copy(), np.zeros(3), np.zeros(3)
+        self._goal = self._x = self.seen.x.copy()
+        self._v, self._a = np.zeros(6), np.zeros(6)
 
     def hold(self, mass: float) -> None:
         """From now on this mass in the hand is known [kg]: its weight and inertia are not felt."""
@@ -79,19 +82,22 @@ class IndustrialSlave(InScene):
 
     def _see(self) -> Seen:
         felt = self._felt
-        # where it is the encoders tell at once; what touches it comes later
-        _, tip, J = self._pose(np.asarray(self._sample.position))
+        # where it is the encoders tell at once; what touches it comes later. Of moments nothing is told: they are free
+        # in the estimator, and a tool that presses has none
+        R, tip, J = self._pose(np.asarray(self._sample.position))
+        unknown = np.full(3, np.inf)
+        seen_std = felt.sliding_std if self._certain else felt.seen_std
         return Seen(
             self._sample.time_ns,
             np.asarray(self._sample.position),
             felt.dq,
-            tip,
-            J[:3] @ felt.dq,
-            felt.force if felt.good else np.zeros(3),
-            felt.std if felt.good else np.full(3, np.inf),
+            pose_of(R, tip),
+            J @ felt.dq,
+            np.concatenate((felt.force if felt.good else np.zeros(3), np.zeros(3))),
+            np.concatenate((felt.std if felt.good else unknown, unknown)),
             self._reason,
             felt.good and self._lost == 0,
-            (felt.sliding_std if self._certain else felt.seen_std) if felt.good else np.full(3, np.inf),
+            np.concatenate((seen_std if felt.good else unknown, unknown)),
         )
 
     def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:
@@ -100,15 +106,17 @@ class IndustrialSlave(InScene):
         A hand's encoder steps would make the currents jump, and then no glitch could be told from them.
         """
         w, h = TRACKER, self._period
-        away = x_ref - self._goal
-        far = float(np.linalg.norm(away))
-        if far > PLAY:
-            self._goal = self._goal + (1.0 - PLAY / far) * away
-        v = v_ref if far > PLAY else np.zeros(3)
-        jerk = w**3 * (self._goal - self._x) + 3.0 * w**2 * (v - self._v) - 3.0 * w * self._a
+        away, v = pose_minus(x_ref, self._goal), v_ref.copy()
+        for axes, play in ((slice(0, 3), PLAY), (slice(3, 6), PLAY_TURN)):
+            far = float(np.linalg.norm(away[axes]))
+            away[axes] *= max(0.0, 1.0 - play / far) if far > 0.0 else 0.0
+            if far <= play:
+                v[axes] = 0.0
+        self._goal = pose_plus(self._goal, away)
+        jerk = w**3 * pose_minus(self._goal, self._x) + 3.0 * w**2 * (v - self._v) - 3.0 * w * self._a
         self._a = self._a + h * jerk
         self._v = self._v + h * self._a
-        self._x = self._x + h * self._v
+        self._x = pose_plus(self._x, h * self._v)
         return super().follow(self._x, self._v, push)
 
     def _torque(self, J: Array, ddq_ref: Array, pushed: Array) -> Array:

@@ -20,7 +20,9 @@ from .channel import UdpChannel
 from .coupling import Event, MasterCommand, SlaveCommand, event_words
 from .ends import PERIOD, MasterEnd, SlaveEnd
 
-_AXES = ("x", "y", "z")
+_AXES = ("x", "y", "z", "turn x", "turn y", "turn z")
+_TURNING = {"m": "rad", "m/s": "rad/s", "N": "N m"}
+"""units of the axes of an orientation"""
 _BEHIND = 0.05
 """a loop that is later than this gives its backlog up [s]"""
 
@@ -124,15 +126,18 @@ class Node:
         elif isinstance(command, SlaveCommand):
             name, seen = "slave", end.seen
             out.sample(now, seen.q, None, end.slave.driver.plant.torque)
-            for what, value, unit in (
-                ("slave_tip", seen.x, "m"),
-                ("slave_reference", command.position, "m"),
-                ("slave_force", seen.force, "N"),
-                ("slave_force_std", seen.std, "N"),
-                ("true_force", end.slave.true_force(), "N"),
+            truth = end.slave.true_wrench()
+            for what, torque, value, unit in (
+                ("slave_tip", "slave_turn", seen.x, "m"),
+                ("slave_reference", "slave_reference_turn", command.position, "m"),
+                ("slave_force", "slave_torque", seen.force, "N"),
+                ("slave_force_std", "slave_torque_std", seen.std, "N"),
+                ("true_force", "true_torque", truth, "N"),
             ):
-                out.signal(what, now, value, unit)
-        out.signal(f"{name}_felt", now, command.felt, "N")
+                out.signal(what, now, value[:3], unit)
+                out.signal(torque, now, value[3:], _TURNING[unit])
+        out.signal(f"{name}_felt", now, command.felt[:3], "N")
+        out.signal(f"{name}_felt_torque", now, command.felt[3:], "N m")
         out.signal(f"{name}_events", now, float(command.events))
         out.signal(f"{name}_tank", now, end.side.tank()["level"], "J")
         clock = self.channel.sealer.clock
@@ -220,12 +225,13 @@ def join(master: Log, slave: Log) -> Log:
     for name, signal in master.signals.items():
         signals[name if name.startswith("master_") else f"master_{name}"] = signal
     assert master.velocity is not None
-    for name, value, unit in (
-        ("master_position", master.position, "m"),
-        ("master_velocity", master.velocity, "m/s"),
-        ("master_force", master.effort, "N"),
+    for name, turn, value, unit in (
+        ("master_position", "master_turn", master.position, "m"),
+        ("master_velocity", "master_spin", master.velocity, "m/s"),
+        ("master_force", "master_torque", master.effort, "N"),
     ):
-        signals[name] = Signal(master.time_ns, value, unit)
+        signals[name] = Signal(master.time_ns, value[:, :3], unit)
+        signals[turn] = Signal(master.time_ns, value[:, 3:], _TURNING[unit])
     events = [LogEvent(e.time_ns, e.kind, f"master: {e.text}") for e in master.events]
     events += [LogEvent(e.time_ns - shift, e.kind, f"slave: {e.text}") for e in slave.events]
     meta = {**slave.meta, "what": "teleoperation", "clock_offset_s": f"{offset:.9g}"}

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from .._core import __version__
+from .._core import __version__, turn_between
 from ..logs import Recorder
 from ..report import StudyRow, joints_figure, write_study
 from .coupling import Event, event_words
-from .figures import Transparency, jumps, transparency
+from .figures import Transparency, jumps, transparency, turning
 from .session import Cut, Run
 from .setups import Setup
 
@@ -27,6 +27,16 @@ _SIGNALS = {
     "slave_force_std": ("std", "N"),
     "true_force": ("true", "N"),
     "tank_levels": ("levels", "J"),
+}
+_TURN_SIGNALS = {
+    "master_turn": ("device_turn", "rad"),
+    "master_torque": ("torque", "N m"),
+    "master_felt_torque": ("felt_torque", "N m"),
+    "slave_turn": ("tip_turn", "rad"),
+    "slave_reference_turn": ("reference_turn", "rad"),
+    "slave_torque": ("estimated_torque", "N m"),
+    "slave_torque_std": ("torque_std", "N m"),
+    "true_torque": ("true_torque", "N m"),
 }
 
 
@@ -46,7 +56,8 @@ def record(run: Run, setup: Setup, path: str | PathLike[str], *, overwrite: bool
         "round_trip_s": f"{run.round_trip:.9g}",
         "motion_scale": f"{setup.motion_scale:g}",
     }
-    units = {"m": "rad", "m/s": "rad/s", "N": "N m"} if run.tip.shape[1] != 3 else {}
+    units = {} if setup.slave.pose else {"m": "rad", "m/s": "rad/s", "N": "N m"}
+    signals = _SIGNALS | (_TURN_SIGNALS if setup.slave.pose else {})
     with Recorder(path, arm.joint_names, session=session, overwrite=overwrite) as out:
         events = list(run.reasons)
         for k, time in enumerate(run.time):
@@ -54,7 +65,7 @@ def record(run: Run, setup: Setup, path: str | PathLike[str], *, overwrite: bool
             while events and events[0][0] <= time:
                 out.event(now, "held", events.pop(0)[1])
             out.sample(now, run.q[k], None, run.effort[k])
-            for name, (column, unit) in _SIGNALS.items():
+            for name, (column, unit) in signals.items():
                 out.signal(name, now, getattr(run, column)[k], units.get(unit, unit))
             out.signal("master_events", now, float(run.master_events[k]))
             out.signal("slave_events", now, float(run.slave_events[k]))
@@ -76,7 +87,7 @@ def rows(run: Run, setup: Setup, cuts: tuple[Cut, ...] = ()) -> list[StudyRow]:
     def row(what: str, value: float, unit: str, note: str = "") -> StudyRow | None:
         return StudyRow(what, ours=value, unit=unit, note=note) if math.isfinite(value) else None
 
-    in_space = run.tip.shape[1] == 3
+    in_space = setup.slave.pose
     N, mm, mm_s = ("N", "mm", "mm/s") if in_space else ("N m", "mrad", "mrad/s")
     contact_error = float(np.abs(np.linalg.norm(run.estimated - run.true, axis=1)).mean())
     every = [
@@ -93,6 +104,23 @@ def rows(run: Run, setup: Setup, cuts: tuple[Cut, ...] = ()) -> list[StudyRow]:
         row("estimated against true force, mean", contact_error, N),
         row("largest true force", float(np.linalg.norm(run.true, axis=1).max(initial=0.0)), N),
     ]
+    if in_space:
+        u = turning(run, torque_scale=setup.follower.torque_scale)
+        every += [
+            row(
+                "tool turned away from where the hand turns it, nothing touched, at most",
+                1e3 * u.tracking,
+                "mrad",
+            ),
+            row("largest true torque about the tool's tip", u.torque, "N m"),
+            row("estimated against true torque, mean", u.estimate_error, "N m", "while it is touched"),
+            row(
+                "torque felt off the true one, mean",
+                100.0 * u.torque_error,
+                "%",
+                f"while {u.torque_held:.3g} N m are held",
+            ),
+        ]
     for time, true, mass, std in run.held:
         every.append(
             row(
@@ -139,7 +167,7 @@ def write_report(
     """
     scale = setup.follower.force_scale
     joints = setup.slave.model.joint_names
-    in_space = run.tip.shape[1] == 3
+    in_space = setup.slave.pose
     axes = ("x", "y", "z") if in_space else joints
     force, place, N, m = ("force", "place", "N", "m") if in_space else ("torque", "angle", "N m", "rad")
     forces = {"true": run.true, "estimated": run.estimated, "felt": run.felt / scale}
@@ -155,6 +183,19 @@ def write_report(
             run.time, {"level": run.levels}, ("master", "slave"), quantity="energy", unit="J"
         ),
     }
+    if in_space:
+        torques = {"true": run.true_torque, "estimated": run.estimated_torque}
+        if np.any(run.felt_torque):
+            torques["felt"] = run.felt_torque / setup.follower.torque_scale
+        away = np.array([turn_between(*row) for row in zip(run.wanted_turn, run.tip_turn, strict=True)])
+        figures |= {
+            "Torque about the tool's tip": joints_figure(
+                run.time, torques, axes, quantity="torque", unit="N m"
+            ),
+            "The tool turned away from where the hand turns it": joints_figure(
+                run.time, {"turned away": away}, axes, quantity="angle", unit="rad"
+            ),
+        }
     told = [f"{time:.3f} s: {reason}" for time, reason in run.reasons]
     seen = np.bitwise_or.reduce(np.concatenate((run.master_events, run.slave_events))) if len(run.time) else 0
     told += [f"happened: {words}" for words in event_words(int(Event(int(seen)))).split("; ") if words]

@@ -11,9 +11,9 @@ import numpy as np
 from .. import robots
 from ..arm import Arm, Array, Sensing, Shape
 from ..errors import InputError, suggest
-from ..simulate._model import mujoco
+from ..simulate._model import mujoco, quaternion
 
-SceneName: TypeAlias = Literal["wall", "rigid", "surface", "peg", "lift"]
+SceneName: TypeAlias = Literal["wall", "rigid", "surface", "peg", "lift", "turn"]
 
 SlaveKind: TypeAlias = Literal["torque", "phase_currents", "servos"]
 
@@ -23,9 +23,15 @@ TOOL = 0.12
 """from the flange to the centre of the tip [m]"""
 PEG_GAP = 0.0015
 """between peg and hole, on each side [m]"""
+KEY_GAP = 0.0003
+"""between key and slot, on each side [m]"""
 _PANEL_MASS = 0.3
 _FIXTURE = 3000.0
 """of the springs on which surface and block stand [N/m]"""
+_VALVE = 1.0
+"""of the torsional spring of the valve [N m/rad]"""
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""axes of a tool that points down"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +47,7 @@ class Scene:
         path: where the hand goes, times [s] to (3,) [m] from its start, in the slave's axes and scale.
         seconds: how long that takes.
         masses: objects taken and put down, (time [s], mass [kg]).
+        turn: how the hand turns, times [s] to (3,) rotation vector [rad] from its start, in the slave's axes.
     """
 
     name: SceneName
@@ -51,6 +58,7 @@ class Scene:
     path: Callable[[float], Array]
     seconds: float
     masses: tuple[tuple[float, float], ...] = ()
+    turn: Callable[[float], Array] = lambda time: np.zeros(3)
 
 
 def smooth(x: float) -> float:
@@ -84,15 +92,17 @@ def find(
     stiffness: float = 2000.0,
     press: float = 0.02,
     masses: tuple[float, ...] = (0.5, 1.2),
+    axes: Array = DOWN,
 ) -> Scene:
     """The scene of that name, placed for a tool whose tip is at `tip` (3,) [m] in the slave's base frame.
 
     Args:
-        name: wall, rigid, surface, peg or lift.
+        name: wall, rigid, surface, peg, lift or turn.
         tip: (3,) [m].
         stiffness: of the wall [N/m].
         press: how far the hand goes beyond the touch [m].
         masses: of the objects to lift [kg].
+        axes: (3, 3) of the tool in the slave's base frame, z along it.
 
     Raises:
         InputError: no such scene, or a number is out of range.
@@ -103,6 +113,7 @@ def find(
         "surface": lambda: _surface(tip, press),
         "peg": lambda: _peg(tip),
         "lift": lambda: _lift(masses),
+        "turn": lambda: _turn(tip, axes),
     }
     if name not in makers:
         raise InputError(f"no scene {name!r}; {suggest(str(name), makers, 'there are')}")
@@ -242,6 +253,45 @@ def _peg(tip: Array) -> Scene:
         None,
         path,
         14.0,
+    )
+
+
+def _turn(tip: Array, axes: Array) -> Scene:
+    """A key at the tool's tip in the slot of a valve that a torsional spring turns back."""
+    blade, wall = (0.02, 0.003, 0.015), (0.026, 0.01, 0.003)  # a low slot: it guides the turn, not the tilt
+
+    def build(spec: Any) -> None:
+        mj = mujoco()
+        spec.body("arm:payload").add_geom(
+            type=mj.mjtGeom.mjGEOM_BOX,
+            size=blade,
+            pos=(0.0, 0.0, TOOL + PROBE + blade[2]),
+            mass=0.0,
+            contype=1,
+            conaffinity=0,
+            rgba=(0.75, 0.6, 0.3, 1.0),
+        )
+        place = np.asarray(tip) + axes[:, 2] * (PROBE + blade[2])
+        valve = spec.worldbody.add_body(name="valve", pos=place, quat=quaternion(axes), gravcomp=1.0)
+        hinge = valve.add_joint(name="valve:turn", axis=(0.0, 0.0, 1.0))
+        hinge.type = mj.mjtJoint.mjJNT_HINGE
+        hinge.stiffness[0], hinge.damping[0], hinge.armature = _VALVE, 0.01, 2e-3
+        for side in (1.0, -1.0):
+            off = side * (blade[1] + KEY_GAP + wall[1])
+            _box(valve, wall, (0.0, off, 0.0), (0.5, 0.52, 0.58, 1.0), 0.5)
+
+    angle = 0.4
+    way = through([(2.0, (0.0,) * 3), (4.0, (angle, 0.0, 0.0)), (6.0, (angle, 0.0, 0.0)), (8.0, (0.0,) * 3)])
+    text = f"turn a valve on a spring of {_VALVE:g} N m/rad by {angle:g} rad with a key, and come back"
+    return Scene(
+        "turn",
+        text,
+        build,
+        1,
+        None,
+        lambda time: np.zeros(3),
+        9.0,
+        turn=lambda time: float(way(time)[0]) * np.asarray(axes)[:, 2],
     )
 
 

@@ -196,6 +196,8 @@ class ServoSlave(InScene):
         self._every, self._tick = round(RATE / BUS_RATE), 0
         super().__init__(driver, scene, model=known)
 
+    pose = False
+
     @property
     def axes(self) -> int:
         """The joints."""

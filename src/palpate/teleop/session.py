@@ -11,6 +11,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from .._core import turn_between, turned
 from ..arm import Array
 from ..errors import InputError
 from .channel import Faults, FaultyLine, Sealer
@@ -53,7 +54,7 @@ class Cut:
 class Run:
     """What happened, one row per period; (N, 3) in base axes of the slave, but the device's own columns.
 
-    Joint to joint they are (N, n), with [rad] and [N m] in place of [m] and [N].
+    Joint to joint they are (N, n), with [rad] and [N m] in place of [m] and [N], and the columns of orientation (N, 0).
 
     Attributes:
         time: (N,) [s].
@@ -65,6 +66,14 @@ class Run:
         felt: of it, what the environment does [N].
         estimated, std: force of the environment by the pipeline [N].
         true: the same from MuJoCo [N].
+        device_turn: orientation of the device, a rotation vector as all orientations here [rad].
+        wanted_turn: where the device turns the tool to, the slave's axes [rad].
+        tip_turn, tip_spin: of the slave's tool [rad, rad/s].
+        reference_turn: of the slave [rad].
+        torque: of the device on the hand, device axes [N m].
+        felt_torque: of it, what the environment does [N m].
+        estimated_torque, torque_std: moment of the environment about the tool's tip by the pipeline [N m].
+        true_torque: the same from MuJoCo [N m].
         master_events, slave_events: (N,) Event bits.
         levels: (N, 2) of the tanks, master and slave [J].
         q: (N, n) of the slave's joints [rad].
@@ -90,6 +99,16 @@ class Run:
     estimated: Array
     std: Array
     true: Array
+    device_turn: Array
+    wanted_turn: Array
+    tip_turn: Array
+    tip_spin: Array
+    reference_turn: Array
+    torque: Array
+    felt_torque: Array
+    estimated_torque: Array
+    torque_std: Array
+    true_torque: Array
     master_events: npt.NDArray[np.int64]
     slave_events: npt.NDArray[np.int64]
     levels: Array
@@ -105,11 +124,14 @@ class Run:
     held: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     @classmethod
-    def empty(cls, count: int, n: int, axes: int = 3) -> Run:
-        """Room for `count` periods of a slave with `n` joints of which `axes` are coupled."""
+    def empty(cls, count: int, n: int, *, pose: bool) -> Run:
+        """Room for `count` periods of a slave with `n` joints, whose pose is coupled, or else its joints."""
 
         def each() -> Array:
-            return np.zeros((count, axes))
+            return np.zeros((count, 3 if pose else n))
+
+        def turn() -> Array:
+            return np.zeros((count, 3 if pose else 0))
 
         return cls(
             time=np.arange(count, dtype=np.float64) * PERIOD,
@@ -124,6 +146,16 @@ class Run:
             estimated=each(),
             std=each(),
             true=each(),
+            device_turn=turn(),
+            wanted_turn=turn(),
+            tip_turn=turn(),
+            tip_spin=turn(),
+            reference_turn=turn(),
+            torque=turn(),
+            felt_torque=turn(),
+            estimated_torque=turn(),
+            torque_std=turn(),
+            true_torque=turn(),
             master_events=np.zeros(count, dtype=np.int64),
             slave_events=np.zeros(count, dtype=np.int64),
             levels=np.zeros((count, 2)),
@@ -148,6 +180,7 @@ def run(
     seconds: float,
     *,
     motion_scale: float = 1.0,
+    turn_scale: float = 1.0,
     faults: Faults | None = None,
     cuts: tuple[Cut, ...] = (),
     closed: Callable[[float], bool] = lambda time: True,
@@ -166,7 +199,7 @@ def run(
         master_side: what the hand feels.
         slave_side: where the slave goes.
         seconds: how long.
-        motion_scale: that of the slave's side, for the column `wanted`.
+        motion_scale, turn_scale: those of the slave's side, for the columns `wanted` and `wanted_turn`.
         faults: of the network, each way; None: none.
         cuts: when the link is dead.
         closed: the clutch at a time [s].
@@ -182,7 +215,7 @@ def run(
     if not 0.0 < seconds <= 3600.0:
         raise InputError(f"seconds must be above 0 to 3600, got {seconds!r}")
     count = round(seconds / PERIOD)
-    out = Run.empty(count, slave.model.n, slave.axes)
+    out = Run.empty(count, slave.model.n, pose=slave.pose)
     rng = np.random.default_rng(seed)
     key = rng.bytes(32)
     boxes = {
@@ -191,7 +224,8 @@ def run(
     }
     there, back = (FaultyLine(seed=seed + k) for k in range(2))
     sent = [0, 0]
-    start = slave.x.copy()
+    places = slice(0, 3 if slave.pose else slave.axes)
+    start = slave.seen.x.copy()
     master, follower = MasterEnd(device, master_side), SlaveEnd(slave, slave_side)
     reason, heard, wish = "", False, Wish(faults or Faults())
     picked: float | None = None
@@ -232,11 +266,23 @@ def run(
             slave.hold(0.0)
             picked = None
 
-        out.device[k], out.device_velocity[k] = master.x, master.v
-        out.force[k], out.felt[k] = command.force, command.felt
-        out.tip[k], out.tip_velocity[k], out.reference[k] = seen.x, seen.v, reference.position
-        out.estimated[k], out.std[k] = seen.force, seen.std
-        out.true[k] = slave.true_force()
+        out.device[k], out.device_velocity[k] = master.x[places], master.v[places]
+        out.force[k], out.felt[k] = command.force[places], command.felt[places]
+        out.tip[k], out.tip_velocity[k] = seen.x[places], seen.v[places]
+        out.reference[k] = reference.position[places]
+        out.estimated[k], out.std[k] = seen.force[places], seen.std[places]
+        if slave.pose:
+            out.device_turn[k], out.reference_turn[k] = master.x[3:], reference.position[3:]
+            out.tip_turn[k], out.tip_spin[k] = seen.x[3:], seen.v[3:]
+            out.torque[k], out.felt_torque[k] = command.force[3:], command.felt[3:]
+            out.estimated_torque[k], out.torque_std[k] = seen.force[3:], seen.std[3:]
+            before = out.wanted_turn[k - 1] if k else start[3:]
+            moved = turn_between(master.x[3:], out.device_turn[max(0, k - 1)])
+            out.wanted_turn[k] = turned(before, turn_scale * moved)
+            truth = slave.true_wrench()
+            out.true[k], out.true_torque[k] = truth[:3], truth[3:]
+        else:
+            out.true[k] = slave.true_force()
         out.master_events[k], out.slave_events[k] = command.events, reference.events
         out.q[k], out.effort[k] = seen.q, slave.driver.plant.torque
         out.levels[k] = master_side.tank()["level"], slave_side.tank()["level"]
@@ -261,7 +307,7 @@ def run(
         value = getattr(out, name)
         if isinstance(value, np.ndarray):
             setattr(out, name, value[:count])
-    out.wanted = start + motion_scale * (out.device - out.device[0])
+    out.wanted = start[places] + motion_scale * (out.device - out.device[0])
     out.offset, out.round_trip = boxes["master"].clock.offset, boxes["master"].clock.round_trip
     span = max(PERIOD, count * PERIOD)
     out.bandwidth = (8.0 * sent[0] / span, 8.0 * sent[1] / span)

@@ -25,10 +25,22 @@ CONTACT_DAMPING = 30.0
 """of the device in contact [N s/m]: it makes up for the estimate's 6 ms and the line's 1 ms"""
 ACCELERATION = 10.0
 """of the slave's reference at most [m/s^2]: twice what a hand does, and what the arm's joints can follow"""
-JOINT_HAND = {"mass": 0.03, "stiffness": 25.0, "damping": 1.2, "tremor": 0.01}
+JOINT_HAND: dict[str, Any] = {"mass": 0.03, "stiffness": 25.0, "damping": 1.2, "tremor": 0.01}
 """a :class:`Hand` of 0.5 kg, 400 N/m at a lever of a quarter metre [kg m^2, N m/rad, N m s/rad, N m]"""
+_TURN_ASSUMED = (
+    "a wrist of 2 g m^2, 3 N m/rad and 0.08 N m s/rad, a gimbal with encoders of 0.1 mrad: no source "
+    "states them"
+)
 REACH = 0.3
 """of the workspace to each side of the start [m]"""
+TORQUE_LIMIT = 0.5
+"""of a device whose gimbal has motors, as the scene "turn" needs one [N m]"""
+TURN_REACH = 1.2
+"""largest angle from the orientation at the start [rad]"""
+TURN_SPEED, TURN_ACCELERATION = 2.0, 15.0
+"""of the reference's orientation at most [rad/s, rad/s^2]"""
+TURN_CONTACT_DAMPING = 0.04
+"""as CONTACT_DAMPING, for a torsional spring of some 5 N m/rad [N m s/rad]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +105,7 @@ def build(
     masses: tuple[float, ...] | None = None,
     motion_scale: float | None = None,
     force_scale: float | None = None,
+    torque_limit: float | None = None,
     hand: Hand | None = None,
     passive: bool = True,
     stiffest: float = STIFFEST,
@@ -101,7 +114,7 @@ def build(
     """A haptic device and an arm in a scene.
 
     Args:
-        scene: wall, rigid, surface, peg, lift, or None for free motion.
+        scene: wall, rigid, surface, peg, lift, turn, or None for free motion.
         arm: the slave, see :func:`palpate.teleop.scenes.slave_arm`.
         coupling: "force_position", "position_position" or "four_channel".
         stiffness: of the wall [N/m].
@@ -109,6 +122,8 @@ def build(
         masses: of the objects to lift [kg]; None: what suits the arm.
         motion_scale: motion of the slave per motion of the master [1]; None: what suits device and arm.
         force_scale: force felt per force of the environment [1]; None: what suits device and arm.
+        torque_limit: largest torque of the device [N m]; 0: its gimbal is measured and has no motors, None: it has them
+            in the scene "turn" alone.
         hand: who holds the device; None: the scene's script.
         passive: the passivity layer.
         stiffest: beyond this stiffness of what it touches the slave gives way [N/m]; infinite: it never does.
@@ -139,7 +154,9 @@ def build(
         motion_scale = 1.0
         master = _leading(chosen.arm.n, device, shared)
     else:
-        device = HapticDevice(hand or scripted(place, motion_scale))
+        if torque_limit is None:
+            torque_limit = TORQUE_LIMIT if scene == "turn" else 0.0
+        device = HapticDevice(hand or scripted(place, motion_scale), torque_limit=torque_limit)
         master = build_master(device, shared)
     return Setup(
         scene=place,
@@ -149,7 +166,7 @@ def build(
         follower=follower,
         motion_scale=motion_scale,
         seconds=10.0 if place is None else place.seconds,
-        assumed=assumed,
+        assumed=assumed if chosen.kind == "servos" else (*assumed, _TURN_ASSUMED),
     )
 
 
@@ -175,8 +192,10 @@ class Shared:
 
 def scripted(scene: Scene | None, motion_scale: float = 1.0) -> Hand:
     """A hand that does what the scene asks for."""
-    path = None if scene is None else scene.path
-    return Hand() if path is None else Hand(wish=lambda t: np.asarray(path(t)) / motion_scale)
+    if scene is None:
+        return Hand()
+    path, turn = scene.path, scene.turn
+    return Hand(wish=lambda t: np.asarray(path(t)) / motion_scale, wish_turn=turn)
 
 
 def scripted_joints(scene: Scene | None, chosen: SlaveArm) -> Hand:
@@ -187,8 +206,18 @@ def scripted_joints(scene: Scene | None, chosen: SlaveArm) -> Hand:
 
 
 def build_master(device: Device, shared: Shared) -> MasterSide:
-    """What the hand feels that holds a device."""
-    return MasterSide(3, device.force_limit, contact_damping=CONTACT_DAMPING, **shared.options())
+    """What the hand feels that holds a device; torques if it has motors for them (`torque_limit` [N m])."""
+    force, torque = (
+        np.broadcast_to(np.asarray(limit, dtype=np.float64), (3,))
+        for limit in (device.force_limit, getattr(device, "torque_limit", 0.0))
+    )
+    return MasterSide(
+        6,
+        np.concatenate((force, torque)),
+        pose=True,
+        contact_damping=[CONTACT_DAMPING] * 3 + [TURN_CONTACT_DAMPING] * 3,
+        **shared.options(),
+    )
 
 
 def build_slave(
@@ -214,7 +243,11 @@ def build_slave(
     T = chosen.arm.forward_kinematics(chosen.q)
     tip: Array = T[:3, :3] @ chosen.arm.grasp + T[:3, 3]
     lifted = chosen.masses if masses is None else masses
-    place = None if scene is None else find(scene, tip, stiffness=stiffness, press=press, masses=lifted)
+    place = (
+        None
+        if scene is None
+        else find(scene, tip, stiffness=stiffness, press=press, masses=lifted, axes=T[:3, :3])
+    )
     if chosen.kind == "servos":
         return ServoSlave(chosen.arm, chosen.q, place, seed=seed), _led(chosen, shared), place, chosen.assumed
     slave = (
@@ -223,12 +256,14 @@ def build_slave(
         else SimulatedSlave(chosen.arm, chosen.q, place, seed=seed, stiffest=stiffest)
     )
     side = SlaveSide(
-        3,
-        chosen.speed,
+        6,
+        [chosen.speed] * 3 + [TURN_SPEED] * 3,
+        pose=True,
         lower=tip - REACH,
         upper=tip + REACH,
+        turn_limit=TURN_REACH,
         force_limit=chosen.force_limit,
-        acceleration=ACCELERATION,
+        acceleration=[ACCELERATION] * 3 + [TURN_ACCELERATION] * 3,
         threshold=chosen.threshold,
         gain=chosen.gain,
         motion_scale=chosen.motion_scale if motion_scale is None else motion_scale,

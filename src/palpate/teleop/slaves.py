@@ -16,6 +16,8 @@ from ..errors import DriverError, InputError
 from ..logs import Sample
 from ..pipeline import Pipeline, Touch
 from ..simulate import Load, Plant, SensorModel
+from .coupling import felt_force
+from .pose import pose_minus, pose_of
 
 if TYPE_CHECKING:
     from .scenes import Scene
@@ -27,7 +29,9 @@ BANDWIDTH = 80.0
 OBSERVER = 180.0
 """bandwidth of the momentum observer [rad/s]: what touches is known 6 ms later"""
 _SINGULAR = 0.08
-"""least singular value of the Jacobian's translation below which the arm slows down [m]"""
+"""least singular value of the tip's Jacobian [m, 1] below which the arm slows down"""
+CLOSING = 100.0
+"""with which the joints' reference closes on the tip's [1/s]"""
 STIFFENING = 40.0
 """bandwidth with which the external torque is taken off [rad/s]: well below the observer's, which is half a period
 late"""
@@ -35,6 +39,8 @@ STIFFEST = 8000.0
 """what the coupling may meet [N/m]: beyond it the arm gives way"""
 _TOUCHING = 5.0
 """standard deviations of the force that are a touch [1]"""
+_CERTAIN = 3.0
+"""standard deviations of a joint's external torque from which on it is taken off [1]"""
 _CHANGES, _STEERING = 60.0, 100.0
 """bandwidths above which changes tell a stiffness, and of what follows from it [rad/s]"""
 _LATELY, _FORGET = 0.05, 0.5
@@ -49,16 +55,16 @@ _SETTLE = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What is known of a slave after a sample.
+    """What is known of a slave after a sample, in the axes that are coupled: those of a pose, or the joints.
 
     Attributes:
         time_ns: of the sample.
         q, dq: (n,) [rad, rad/s].
-        x, v: (3,) of the tool's tip, base frame [m, m/s].
-        force, std: (3,) of the environment on the tool as estimated, base axes [N].
+        x, v: (6,) pose of the tool's tip, base axes [m, rad], and its velocity [m/s, rad/s].
+        force, std: (6,) force and moment about the tip of the environment on the tool as estimated, base axes [N, N m].
         reason: why it holds or slows down, empty: it does not.
         usable: it may be moved.
-        felt_std: (3,) deviation that decides what a hand is shown [N]; None: `std`.
+        felt_std: (6,) deviation that decides what a hand is shown [N, N m]; None: `std`.
     """
 
     time_ns: int
@@ -99,9 +105,9 @@ class Stiffness:
 
     def step(self, seen: Seen, h: float) -> None:
         """A period of `h` [s] later."""
-        F = seen.force
-        self._x = seen.x if self._x is None else self._x - math.expm1(-OBSERVER * h) * (seen.x - self._x)
-        felt = bool(np.linalg.norm(F) > _TOUCHING * np.linalg.norm(seen.std))
+        F, x = seen.force[:3], seen.x[:3]
+        self._x = x if self._x is None else self._x - math.expm1(-OBSERVER * h) * (x - self._x)
+        felt = bool(np.linalg.norm(F) > _TOUCHING * np.linalg.norm(seen.std[:3]))
         self._free = 0.0 if felt else self._free + h
         if not felt:
             self._slow_x, self._slow_F = self._x, F
@@ -122,7 +128,7 @@ class Stiffness:
 
 
 class ArmSlave:
-    """Follows a reference of its tool's tip, keeping the tool's orientation, and estimates what touches it.
+    """Follows a reference of its tool's tip, place and orientation, and estimates what touches it.
 
     Resolved rates with damping near singular poses give joint references; each joint follows by computed torque,
     and the estimated external
@@ -179,7 +185,6 @@ class ArmSlave:
         self._dq_ref = np.zeros(arm.n)
         self._taken_off = np.zeros(arm.n)
         self._stiffest, self._stiffness = stiffest, Stiffness(stiffest)
-        self._R0 = self._pose(self._q_ref)[0]
         self._reason = ""
         self.seen = self._see()
 
@@ -201,39 +206,37 @@ class ArmSlave:
     def _pose(self, q: Array) -> tuple[Array, Array, Array]:
         """R_base_tip, place of the tool's tip, (6, n) Jacobian there."""
         T = self.model.forward_kinematics(q)
-        J = self.model.jacobian(q)
+        J = self.model.jacobian(q, self.model.grasp)
         tip = T[:3, :3] @ self.model.grasp + T[:3, 3]
         return T[:3, :3], tip, J
 
     @property
     def x(self) -> Array:
         """(3,) of the tool's tip [m]."""
-        return self.seen.x
+        return self._pose(self.seen.q)[1]
 
     def _see(self) -> Seen:
         touch, q = self._touch, np.asarray(self._sample.position)
         dq = np.asarray(touch.dq)
-        _, tip, J = self._pose(q)
+        R, tip, J = self._pose(q)
         wrench = touch.wrench
         assert wrench is not None
+        force = np.concatenate((wrench.force, wrench.moment))
         good = wrench.status in (Status.ok, Status.saturated, Status.singular) and bool(
-            np.isfinite(wrench.force).all()
+            np.isfinite(force).all()
         )
-        force, std = (
-            (np.array(wrench.force), np.array(wrench.force_std))
-            if good
-            else (np.zeros(3), np.full(3, np.inf))
-        )
+        std = np.concatenate((wrench.force_std, wrench.moment_std)) if good else np.full(6, np.inf)
+        force = force if good else np.zeros(6)
         if self._tare is None:
             if good:
                 self._rest.append(force)
             if self._steps >= _SETTLE * RATE and self._rest:
                 self._tare = np.mean(self._rest[len(self._rest) // 2 :], axis=0)
-            force = np.zeros(3)
+            force = np.zeros(6)
         else:
             force = force - self._tare if good else force
         usable = self._tare is not None and self._lost == 0
-        return Seen(self._sample.time_ns, q, dq, tip, J[:3] @ dq, force, std, self._reason, usable)
+        return Seen(self._sample.time_ns, q, dq, pose_of(R, tip), J @ dq, force, std, self._reason, usable)
 
     def read(self) -> Seen:
         """The next period's sample. A lost one holds the last; a device that is gone stops the arm, and says so.
@@ -258,14 +261,14 @@ class ArmSlave:
         return self.seen
 
     def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:
-        """Send the torque that takes the tool's tip to `x_ref` (3,) [m] at `v_ref` (3,) [m/s]; `push` (3,) [N]
-        beside it.
+        """Send the torque that takes the tool's tip to the pose `x_ref` (6,) [m, rad] at `v_ref` (6,) [m/s, rad/s];
+        `push` (6,) [N, N m] beside it.
 
         Returns:
             (n,) torque sent [N m]; zeros if the drives are off.
         """
         J, ddq_ref = self._lead(x_ref, v_ref)
-        pushed = np.zeros(self.model.n) if push is None else J[:3].T @ push
+        pushed = np.zeros(self.model.n) if push is None else J.T @ push
         torque = self._torque(J, ddq_ref, pushed)
         if self.driver.state != "enabled":
             return np.zeros(self.model.n)
@@ -276,9 +279,8 @@ class ArmSlave:
         acceleration (n,) [rad/s^2]."""
         n, h = self.model.n, self._period
         R, tip, J = self._pose(self._q_ref)
-        turn = self._R0 @ R.T
-        angle = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        task = np.concatenate((v_ref + 100.0 * (x_ref - tip), 50.0 * angle))
+        # both references are of the end of this period: what is compared is where they were at its beginning
+        task = v_ref + CLOSING * (pose_minus(x_ref, pose_of(R, tip)) - h * v_ref)
         U, s, Vt = np.linalg.svd(J, full_matrices=True)
         damp = 0.0 if s[-1] >= _SINGULAR else 0.02 * (1.0 - (s[-1] / _SINGULAR) ** 2)
         self._reason = (
@@ -306,15 +308,17 @@ class ArmSlave:
         seen, external, h = self.seen, self._touch.external, self._period
         self._stiffness.step(seen, h)
         share = self._stiffness.share
-        behind, ahead = self._q_ref - seen.q, share * self._dq_ref
+        # the reference is of the end of this period, the sample of its beginning
+        behind, ahead = self._q_ref - h * self._dq_ref - seen.q, share * self._dq_ref
         a = share * ddq_ref + BANDWIDTH**2 * behind + 2.0 * BANDWIDTH * (ahead - seen.dq)
         if share < 1.0:
             a = a - (1.0 - share) * self._too_stiff(J[:3], seen.q, behind)
         torque = self.model.inverse_dynamics(seen.q, seen.dq, a) + self.model.friction_torque(seen.dq)
         if external.status == Status.ok:
-            # what the hand's push already bears is not taken off a second time
+            # what the hand's push already bears is not taken off a second time; noise would turn a light wrist about
+            certain = felt_force(np.asarray(external.torque), np.asarray(external.std), _CERTAIN)
             self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (
-                external.torque + pushed - self._taken_off
+                certain + pushed - self._taken_off
             )
         found: Array = torque + share * (pushed - self._taken_off)
         return found
@@ -363,10 +367,13 @@ class InScene(ArmSlave):
         self._masses = list(() if scene is None else scene.masses)
         self._contact = np.zeros(6)
 
+    pose = True
+    """what is coupled are the axes of a pose; False: the joints"""
+
     @property
     def axes(self) -> int:
-        """What is coupled: three of space, or the joints."""
-        return 3
+        """What is coupled: six of a pose, or the joints."""
+        return 6
 
     @property
     def plant(self) -> Plant:
@@ -385,21 +392,29 @@ class InScene(ArmSlave):
             changed = mass
         return changed
 
-    def true_force(self) -> Array:
-        """(3,) of the scene on the arm, base axes, from MuJoCo's contacts [N]."""
+    def true_wrench(self) -> Array:
+        """(6,) force of the scene on the arm [N] and its moment about the tool's tip [N m], base axes, from MuJoCo's
+        contacts."""
         from ..simulate._model import mujoco
 
         plant = self.plant
         mj, model, data = mujoco(), plant.model, plant.data
-        total = np.zeros(3)
+        total = np.zeros(6)
+        tip = self._pose(plant.q)[1] if data.ncon else total[:3]
         for k in range(data.ncon):
             contact = data.contact[k]
             mj.mj_contactForce(model, data, k, self._contact)
-            force = contact.frame.reshape(3, 3).T @ self._contact[:3]
+            axes = contact.frame.reshape(3, 3).T
+            force, twist = axes @ self._contact[:3], axes @ self._contact[3:]
             # along the normal from the first geom to the second: on the second
-            own = _of_arm(model, contact.geom2)
-            total += force if own else -force
+            sign = 1.0 if _of_arm(model, contact.geom2) else -1.0
+            total[:3] += sign * force
+            total[3:] += sign * (np.cross(contact.pos - tip, force) + twist)
         return total
+
+    def true_force(self) -> Array:
+        """(3,) of the scene on the arm, base axes, from MuJoCo's contacts [N]."""
+        return self.true_wrench()[:3]
 
 
 class SimulatedSlave(InScene):

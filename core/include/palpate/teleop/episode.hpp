@@ -15,6 +15,9 @@ struct EpisodeConfig {
   Coupling coupling = Coupling::force_position;
   Layer layer = Layer::tanks;
   int axes = 1;                   ///< 1 to 3; the wall is across the first
+  bool pose = false;              ///< three axes and the orientation; its wall is a largest angle. Its masses, forces, ways: at a lever of 0.1 m
+  bool torque = true;             ///< the device shows torques; false: it measures its orientation
+  double turn_scale = 1.0;
   double seconds = 10.0;          ///< the last four the hand wants to be still
   // network, each way
   double delay = 0.0;             ///< [s], at most 0.6
@@ -57,7 +60,7 @@ struct EpisodeConfig {
 struct EpisodeResult {
   double generated = 0.0;      ///< largest of (given - taken) by both ports together, the master's scale [J]; <= 0: passive
   double lowest = 0.0;         ///< of the tanks' levels [J]
-  double force = 0.0;          ///< largest of the device [N]
+  double force = 0.0;          ///< largest of the device [N]; of an orientation everything as at the lever of 0.1 m
   double speed = 0.0;          ///< largest of the reference [m/s]
   double shaking = 0.0;        ///< RMS speed of the hand in the last second and a half [m/s]
   double slave_shaking = 0.0;  ///< and of the slave [m/s]
@@ -125,6 +128,9 @@ inline EpisodeConfig random_episode(std::uint64_t seed) {
     c.cut_at = r(2.0, 4.0);
     c.seconds = c.cut_at + c.cut + 7.0;
   }
+  c.pose = r(0.0, 1.0) < 0.2;
+  c.torque = r(0.0, 1.0) < 0.6;
+  c.turn_scale = r.log(0.5, 2.0);
   return c;
 }
 
@@ -158,7 +164,8 @@ class EpisodeNetwork {
 ///
 /// Hand and device: m x'' = F + K_h (x_i - x) - B_h x' + tremor. Slave: m x'' = K (x_r - x) + D (v_r - x') - f x' + F_ff - wall, spring and
 /// damper to the reference being its position control. The port's force is that spring's and damper's, known without an estimate, and all
-/// else is passive: so energy that appears is the coupling's and the network's, and none may.
+/// else is passive: so energy that appears is the coupling's and the network's, and none may. An orientation is a body of equal inertia about all
+/// axes on springs of torque K log(R_r R^T), whose energy is K |log|^2/2; the wave line has places alone.
 inline EpisodeResult run_episode(const EpisodeConfig& c, std::uint64_t seed) {
   check::in_range("EpisodeConfig axes", c.axes, 1, 3);
   check::positive("EpisodeConfig hand_mass [kg]", c.hand_mass);
@@ -168,8 +175,11 @@ inline EpisodeResult run_episode(const EpisodeConfig& c, std::uint64_t seed) {
   if (!(c.seconds >= 5.0 && c.seconds <= 3600.0)) check::fail("EpisodeConfig seconds [s]", c.seconds, "5 to 3600");
   constexpr double T = 1e-3, pi = 3.141592653589793;
   constexpr int substeps = 10;
-  const auto n = static_cast<std::size_t>(c.axes);
-  const bool tanks = c.layer == Layer::tanks, waves = c.layer == Layer::waves;
+  const bool tanks = c.layer == Layer::tanks, waves = c.layer == Layer::waves, pose = c.pose && !waves;
+  const std::size_t n = pose ? 6 : static_cast<std::size_t>(c.axes);
+  const Manifold space(n, pose);
+  JointVector lever{};  // axis i is an angle times that [m], or a way
+  for (std::size_t i = 0; i < n; ++i) lever[i] = space.turns(i) ? 0.1 : 1.0;
   EpisodeRandom random(seed ^ 0xABCDEF);
   EpisodeNetwork there(c, seed * 2 + 1), back(c, seed * 2 + 2);
 
@@ -180,30 +190,33 @@ inline EpisodeResult run_episode(const EpisodeConfig& c, std::uint64_t seed) {
   mc.link = sc.link = c.link;
   mc.tank = sc.tank = c.tank;
   mc.passive = sc.passive = tanks;
-  sc.task_space = false;
+  sc.task_space = mc.pose = sc.pose = pose;
+  sc.turn_scale = c.turn_scale;
   sc.motion_scale = c.motion_scale;
   sc.force_scale = c.force_scale;
   for (std::size_t i = 0; i < n; ++i) {
-    mc.force_limit[i] = c.force_limit;
-    mc.stiffness[i] = c.coupling_stiffness;
-    mc.damping[i] = c.coupling_damping;
-    mc.resync_rate[i] = 150.0;
-    mc.fill[i] = tanks ? c.fill : 0.0;
-    mc.hold_stiffness[i] = 200.0;
-    mc.hold_damping[i] = 2.0;
-    mc.acceleration[i] = c.force_limit / c.hand_mass + 200.0;
+    const double L = lever[i];
+    mc.force_limit[i] = space.turns(i) && !c.torque ? 0.0 : c.force_limit * L;
+    mc.stiffness[i] = c.coupling_stiffness * L * L;
+    mc.damping[i] = c.coupling_damping * L * L;
+    mc.resync_rate[i] = 150.0 * L;
+    mc.fill[i] = tanks ? c.fill * L * L : 0.0;
+    mc.hold_stiffness[i] = 200.0 * L * L;
+    mc.hold_damping[i] = 2.0 * L * L;
+    mc.acceleration[i] = (c.force_limit / c.hand_mass + 200.0) / L;
     sc.lower[i] = -0.5;
     sc.upper[i] = 0.5;
-    sc.speed[i] = c.speed;
-    sc.acceleration[i] = 50.0;
-    sc.resync_speed[i] = 0.05;
-    sc.resync_acceleration[i] = 0.2;
-    sc.stiffness[i] = c.slave_stiffness + 2.0 * slave_damping / T;
-    sc.wall[i] = 500.0;
-    sc.force_limit[i] = c.force_limit / c.force_scale;
+    sc.speed[i] = c.speed / L;
+    sc.acceleration[i] = 50.0 / L;
+    sc.resync_speed[i] = 0.05 / L;
+    sc.resync_acceleration[i] = 0.2 / L;
+    sc.stiffness[i] = (c.slave_stiffness + 2.0 * slave_damping / T) * L * L;
+    sc.wall[i] = 500.0 * L * L;
+    sc.force_limit[i] = c.force_limit / c.force_scale * L;
   }
-  MasterSide master(c.axes, mc);
-  SlaveSide slave(c.axes, sc);
+  const int axes = static_cast<int>(n);
+  MasterSide master(axes, mc);
+  SlaveSide slave(axes, sc);
   master.begin(1);
   slave.begin(1);
   const WaveLine line(c.impedance);
@@ -212,8 +225,8 @@ inline EpisodeResult run_episode(const EpisodeConfig& c, std::uint64_t seed) {
   EpisodeResult out;
   JointVector x{}, v{}, X{}, V{}, reference{}, port{}, estimate{}, wall_force{}, F{}, v_ref{};
   JointVector std{};
-  std.fill(c.noise);
-  std::array<std::array<double, 11>, 3> recent_F{}, recent_v{};
+  for (std::size_t i = 0; i < n; ++i) std[i] = c.noise * lever[i];
+  std::array<std::array<double, 11>, 6> recent_F{}, recent_v{};
   double balance = 0.0, shaking = 0.0, slave_shaking = 0.0, error = 0.0, contact = 0.0;
   int last = 0, quiet = 0, after_return = -1;
   double before_cut = 0.0;
@@ -252,7 +265,7 @@ inline EpisodeResult run_episode(const EpisodeConfig& c, std::uint64_t seed) {
       JointVector hand{}, felt{};
       for (std::size_t i = 0; i < n; ++i) {
         estimate[i] += (T / (c.lag + T)) * (wall_force[i] - estimate[i]);
-        felt[i] = estimate[i] + c.noise * random.normal();
+        felt[i] = estimate[i] + std[i] * random.normal();
         hand[i] = -F[i];  // quasi-static: what the device pushes, the hand pushes back
       }
       const MasterCommand mcmd = master.step(x, v, hand, true, T, k);
@@ -265,38 +278,63 @@ inline EpisodeResult run_episode(const EpisodeConfig& c, std::uint64_t seed) {
     }
 
     // physics
+    JointVector wish{};
+    const JointVector ahead = space.minus(next, reference);
+    const double stop = c.seconds - 4.0;
+    const double ease = std::min(1.0, t / 1.0), moving = t < stop ? 1.0 : std::exp(-(t - stop) / 0.1);
     for (std::size_t i = 0; i < n; ++i) {
       F[i] = command[i];
-      v_ref[i] = (next[i] - reference[i]) / T;
-      const double stop = c.seconds - 4.0;
-      const double ease = std::min(1.0, t / 1.0), moving = t < stop ? 1.0 : std::exp(-(t - stop) / 0.1);
-      const double aim = (c.wall_at + c.depth) / c.motion_scale;
-      const double wobble = std::min(c.wobble / c.motion_scale, 0.05);
-      const double wish = (i == 0 ? std::min(aim, 0.4) * ease * ease * (3.0 - 2.0 * ease) : 0.0) +
-                          moving * wobble * std::sin(2.0 * pi * c.wobble_rate * (1.0 + 0.3 * static_cast<double>(i)) * t);
-      const double h = T / substeps;
-      double device_work = 0.0, slave_work = 0.0;
-      for (int s = 0; s < substeps; ++s) {
-        const double ts = t + s * h;
-        const double tremor = c.hand_stiffness > 0.0 ? c.tremor * std::sin(2.0 * pi * c.tremor_rate * ts + static_cast<double>(i)) : 0.0;
-        v[i] += h / c.hand_mass * (F[i] + c.hand_stiffness * (wish - x[i]) - c.hand_damping * v[i] + tremor);
-        x[i] += h * v[i];
-        device_work += F[i] * h * v[i];
-
-        const double at = reference[i] + v_ref[i] * h * (s + 0.5);
-        const double pull = c.slave_stiffness * (at - X[i]) + slave_damping * (v_ref[i] - V[i]);
-        const double deep = i == 0 ? X[i] - c.wall_at : -1.0;
-        wall_force[i] = deep > 0.0 ? -std::max(0.0, c.wall * deep + c.wall_damping * V[i]) : 0.0;
-        V[i] += h / c.slave_mass * (pull + push[i] - c.slave_friction * V[i] + wall_force[i]);
-        X[i] += h * V[i];
-        slave_work += (pull * v_ref[i] + push[i] * V[i]) * h;
+      v_ref[i] = ahead[i] / T;
+      const double scale = lever[i] * (space.turns(i) ? c.turn_scale : c.motion_scale);
+      const double aim = (c.wall_at + c.depth) / scale;
+      const double wobble = std::min(c.wobble / scale, 0.05 / lever[i]);
+      wish[i] = (i % 3 == 0 ? std::min(aim, space.turns(i) ? 1.4 : 0.4) * ease * ease * (3.0 - 2.0 * ease) : 0.0) +
+                moving * wobble * std::sin(2.0 * pi * c.wobble_rate * (1.0 + 0.3 * static_cast<double>(i)) * t);
+    }
+    const double h = T / substeps;
+    JointVector half{}, way{};
+    double work = 0.0;
+    for (int s = 0; s < substeps; ++s) {
+      const double ts = t + s * h;
+      const JointVector yearning = space.minus(wish, x);
+      for (std::size_t i = 0; i < n; ++i) {
+        const double L = lever[i];
+        const double tremor = c.hand_stiffness > 0.0 ? c.tremor * L * std::sin(2.0 * pi * c.tremor_rate * ts + static_cast<double>(i)) : 0.0;
+        v[i] += h / (c.hand_mass * L * L) * (F[i] + L * L * (c.hand_stiffness * yearning[i] - c.hand_damping * v[i]) + tremor);
+        way[i] = h * v[i];
+        work += F[i] * way[i];
+        half[i] = v_ref[i] * h * (s + 0.5);
       }
-      balance += device_work + power_scale * slave_work;
-      reference[i] = next[i];
+      x = space.plus(x, way);
+
+      const JointVector behind = space.minus(space.plus(reference, half), X);
+      const Vec3<double> theta = Manifold::turn(X);
+      const double angle = pose ? std::sqrt(dot(theta, theta)) : 0.0;
+      for (std::size_t i = 0; i < n; ++i) {
+        const double L2 = lever[i] * lever[i];
+        const double pull = L2 * (c.slave_stiffness * behind[i] + slave_damping * (v_ref[i] - V[i]));
+        if (space.turns(i)) {
+          const double deep = angle - c.wall_at / lever[i];
+          wall_force[i] = deep > 0.0 ? -L2 * (c.wall * deep * X[i] / angle + c.wall_damping * V[i]) : 0.0;
+        } else {
+          const double deep = i == 0 ? X[i] - c.wall_at : -1.0;
+          wall_force[i] = deep > 0.0 ? -std::max(0.0, c.wall * deep + c.wall_damping * V[i]) : 0.0;
+        }
+        V[i] += h / (c.slave_mass * L2) * (pull + push[i] - L2 * c.slave_friction * V[i] + wall_force[i]);
+        way[i] = h * V[i];
+        // what no torque is shown of is no port
+        if (!space.turns(i) || c.torque) work += power_scale * (pull * v_ref[i] + push[i] * V[i]) * h;
+      }
+      X = space.plus(X, way);
+    }
+    balance += work;
+    reference = next;
+    const JointVector behind = space.minus(reference, X);
+    for (std::size_t i = 0; i < n; ++i) {
       // what the reference works against: its own spring and damper, which the slave's controller knows
-      port[i] = -(c.slave_stiffness * (reference[i] - X[i]) + slave_damping * (v_ref[i] - V[i]));
-      out.force = std::max(out.force, std::abs(F[i]));
-      out.speed = std::max(out.speed, std::abs(v_ref[i]));
+      port[i] = -lever[i] * lever[i] * (c.slave_stiffness * behind[i] + slave_damping * (v_ref[i] - V[i]));
+      out.force = std::max(out.force, std::abs(F[i]) / lever[i]);
+      out.speed = std::max(out.speed, std::abs(v_ref[i]) * lever[i]);
       out.finite = out.finite && std::isfinite(x[i]) && std::isfinite(X[i]) && std::abs(x[i]) < 1e3 && std::abs(X[i]) < 1e3;
     }
     out.generated = std::max(out.generated, balance);
@@ -304,8 +342,8 @@ inline EpisodeResult run_episode(const EpisodeConfig& c, std::uint64_t seed) {
 
     if (t >= c.seconds - 1.5) {
       for (std::size_t i = 0; i < n; ++i) {
-        shaking += v[i] * v[i];
-        slave_shaking += V[i] * V[i];
+        shaking += lever[i] * lever[i] * v[i] * v[i];
+        slave_shaking += lever[i] * lever[i] * V[i] * V[i];
       }
       error += std::abs(F[0] - c.force_scale * wall_force[0]);
       contact += std::abs(wall_force[0]);
@@ -321,8 +359,8 @@ inline EpisodeResult run_episode(const EpisodeConfig& c, std::uint64_t seed) {
           for (const int past : {1, 5, 10}) {
             if (after_return < past && k < past) continue;
             const auto slot = static_cast<std::size_t>((last + 11 - past) % 11);
-            out.force_jump = std::max(out.force_jump, std::abs(F[i] - recent_F[i][slot]));
-            out.speed_jump = std::max(out.speed_jump, std::abs(v_ref[i] - recent_v[i][slot]));
+            out.force_jump = std::max(out.force_jump, std::abs(F[i] - recent_F[i][slot]) / lever[i]);
+            out.speed_jump = std::max(out.speed_jump, std::abs(v_ref[i] - recent_v[i][slot]) * lever[i]);
           }
         ++after_return;
       }
@@ -339,7 +377,7 @@ inline EpisodeResult run_episode(const EpisodeConfig& c, std::uint64_t seed) {
   out.felt_error = error / count;
   out.contact = contact / count;
   out.lowest = std::min(master.tank().lowest(), slave.tank().lowest());
-  for (std::size_t i = 1; i < n; ++i) out.drift = std::max(out.drift, std::abs(X[i] - c.motion_scale * x[i]));
+  for (std::size_t i = 1; i < std::min<std::size_t>(n, 3); ++i) out.drift = std::max(out.drift, std::abs(X[i] - c.motion_scale * x[i]));
   return out;
 }
 

@@ -11,13 +11,14 @@ struct Message {
   std::uint64_t session = 0;    ///< of the sender; a later start has a larger one, 0 is none
   std::uint64_t sequence = 0;   ///< counts up from 1 within a session; 0: no message
   std::int64_t time_ns = 0;     ///< sender's clock [ns]
-  JointVector position{};       ///< of the sender [m] or [rad]
+  JointVector position{};       ///< of the sender [m] or [rad]; an orientation as a rotation vector (Manifold)
   JointVector velocity{};       ///< [m/s] or [rad/s]
   JointVector force{};          ///< master: of the hand on the device; slave: of the environment, as it is to be felt [N] or [N m]
   double energy = 0.0;          ///< sent since the session began: it never falls, so loss and repetition do no harm [J]
   double booked = 0.0;          ///< of what the other side has sent: the rest is still on its way [J]
   double level = 0.0;           ///< of the sender's tank [J]
   bool engaged = false;         ///< the sender wants to be coupled: the clutch is closed
+  std::uint16_t shown = 0xFFFF; ///< bit i: the sender's axis i has a motor. One that is only measured is no port: no work comes back by it
 };
 
 /// What is the matter; a bit mask, 0 where everything is as wanted.
