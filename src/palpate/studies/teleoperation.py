@@ -20,7 +20,7 @@ from ..teleop.scenes import smooth
 from ..teleop.session import Cut, Run
 from ..teleop.setups import build
 from ..teleop.slaves import STIFFEST
-from . import Progress, Row, _figures, _teleop_slaves
+from . import Progress, Row, _figures, _teleop_slaves, _teleop_turning
 from ._rows import at_most, told
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     cuts = CUTS[1:2] if quick else CUTS
     whole = 5.5 if quick else None
     more = _teleop_slaves.QUICK_JOBS if quick else _teleop_slaves.JOBS
+    more += _teleop_turning.QUICK_JOBS if quick else _teleop_turning.JOBS
     total, begin, done = len(walls) + len(cuts) + len(COUPLINGS) + 6 + more, clock.perf_counter(), 0
 
     def next_one() -> None:
@@ -96,6 +97,7 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     next_one()
     rows = _rows(free, pressed, dead, with_layer, without, times)
     rows += _rigid_rows(rigid) + _coupling_rows(coupled)
+    rows += _teleop_turning.rows(quick, next_one)
     rows += _teleop_slaves.rows(quick, next_one)
     setup_notes = [
         "Slave: KUKA LBR iiwa 14 in MuJoCo with a stick of 12 cm, its model known exactly; encoders of 1 "

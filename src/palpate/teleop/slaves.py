@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._core import HeldLoad, MomentumObserver, Status, WrenchEstimator
+from .._core import HeldLoad, MomentumObserver, Status, WrenchEstimator, rotation_vector, turn_between
 from ..arm import Arm, Array
 from ..drivers.mujoco import MujocoDriver
 from ..errors import DriverError, InputError
 from ..logs import Sample
 from ..pipeline import Pipeline, Touch
 from ..simulate import Load, Plant, SensorModel
-from .coupling import felt_force
+from .coupling import LEVER, felt_force
 from .pose import pose_minus, pose_of
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ STIFFENING = 40.0
 """bandwidth with which the external torque is taken off [rad/s]: well below the observer's, which is half a period
 late"""
 STIFFEST = 8000.0
-"""what the coupling may meet [N/m]: beyond it the arm gives way"""
+"""what the coupling may meet [N/m]: beyond it the arm gives way; turned, what is alike at a :data:`LEVER` [N m/rad]"""
 _TOUCHING = 5.0
 """standard deviations of the force that are a touch [1]"""
 _CERTAIN = 3.0
@@ -46,9 +46,11 @@ _CHANGES, _STEERING = 60.0, 100.0
 _LATELY, _FORGET = 0.05, 0.5
 """time constant of the mean squares, and how long after a touch they are forgotten [s]"""
 _CHANGING = 1.0
-"""a force that changes by less says nothing of the stiffness [N]"""
+"""a force that changes by less says nothing of the stiffness [N]; a torque at a :data:`LEVER` [N m]"""
 _JERKY = 20.0
 """acceleration of a joint's reference at most [rad/s^2]"""
+_PARTS = (slice(0, 3), slice(3, 6))
+"""axes of the place, and of the turn"""
 _SETTLE = 0.4
 """at the start, over which what is felt at rest is taken for the model's error [s]"""
 
@@ -80,7 +82,8 @@ class Seen:
 
 
 class Stiffness:
-    """How stiff what the tool touches is, and how much of its force may be taken off.
+    """How stiff what the tool touches is, and how much of its force may be taken off; or what it is turned against, and
+    how much of its torque.
 
     Taking the touch's force off makes the arm infinitely stiff, so that it goes where it is told through whatever
     yields. Against what does not yield, it and the touch push each other to and fro with the lag of the estimate.
@@ -92,10 +95,16 @@ class Stiffness:
     dx, dF high-passed. Up to K_s, the stiffest, nothing changes; beyond it the arm gives way like a spring, and the
     coupling never meets more. While the force changes by less than its noise the last value holds; half a second
     after the touch it is forgotten.
+
+    Args:
+        stiffest: K_s [N/m, N m/rad].
+        changing: a force that changes by less says nothing [N, N m].
     """
 
-    def __init__(self, stiffest: float) -> None:
-        self._stiffest = stiffest
+    def __init__(self, stiffest: float, changing: float) -> None:
+        self.stiffest = stiffest
+        """[N/m, N m/rad]"""
+        self._changing = changing
         self._x: Array | None = None
         self._slow_x = self._slow_F = np.zeros(3)
         self._together = self._changes = 0.0
@@ -103,11 +112,10 @@ class Stiffness:
         self.share = 1.0
         """part of the force that may be taken off [1]"""
 
-    def step(self, seen: Seen, h: float) -> None:
-        """A period of `h` [s] later."""
-        F, x = seen.force[:3], seen.x[:3]
+    def step(self, x: Array, F: Array, std: Array, h: float) -> None:
+        """A period of `h` [s] later: place or turn (3,), force or torque and its standard deviation (3,)."""
         self._x = x if self._x is None else self._x - math.expm1(-OBSERVER * h) * (x - self._x)
-        felt = bool(np.linalg.norm(F) > _TOUCHING * np.linalg.norm(seen.std[:3]))
+        felt = bool(np.linalg.norm(F) > _TOUCHING * np.linalg.norm(std))
         self._free = 0.0 if felt else self._free + h
         if not felt:
             self._slow_x, self._slow_F = self._x, F
@@ -122,8 +130,8 @@ class Stiffness:
         lately = -math.expm1(-h / _LATELY)
         self._together += lately * (-float(dx @ dF) - self._together)
         self._changes += lately * (float(dF @ dF) - self._changes)
-        if self._changes > _CHANGING**2:
-            share = min(1.0, max(0.0, self._stiffest * self._together / self._changes))
+        if self._changes > self._changing**2:
+            share = min(1.0, max(0.0, self.stiffest * self._together / self._changes))
             self.share -= math.expm1(-_STEERING * h) * (share - self.share)
 
 
@@ -184,7 +192,11 @@ class ArmSlave:
         self._home = self._q_ref.copy()
         self._dq_ref = np.zeros(arm.n)
         self._taken_off = np.zeros(arm.n)
-        self._stiffest, self._stiffness = stiffest, Stiffness(stiffest)
+        self._stiffness = (
+            Stiffness(stiffest, _CHANGING),
+            Stiffness(stiffest * LEVER**2, _CHANGING * LEVER),
+        )
+        self._R0 = rotation_vector(self._pose(self._q_ref)[0].ravel())
         self._reason = ""
         self.seen = self._see()
 
@@ -306,35 +318,35 @@ class ArmSlave:
     def _torque(self, J: Array, ddq_ref: Array, pushed: Array) -> Array:
         """(n,) that takes the joints along their reference, and `pushed` (n,) beside it [N m]."""
         seen, external, h = self.seen, self._touch.external, self._period
-        self._stiffness.step(seen, h)
-        share = self._stiffness.share
+        turn = turn_between(seen.x[3:], self._R0)
+        for part, x, axes in zip(self._stiffness, (seen.x[:3], turn), _PARTS, strict=True):
+            part.step(x, seen.force[axes], seen.std[axes], h)
         # the reference is of the end of this period, the sample of its beginning
-        behind, ahead = self._q_ref - h * self._dq_ref - seen.q, share * self._dq_ref
-        a = share * ddq_ref + BANDWIDTH**2 * behind + 2.0 * BANDWIDTH * (ahead - seen.dq)
-        if share < 1.0:
-            a = a - (1.0 - share) * self._too_stiff(J[:3], seen.q, behind)
-        torque = self.model.inverse_dynamics(seen.q, seen.dq, a) + self.model.friction_torque(seen.dq)
+        behind = self._q_ref - h * self._dq_ref - seen.q
         if external.status == Status.ok:
             # what the hand's push already bears is not taken off a second time; noise would turn a light wrist about
             certain = felt_force(np.asarray(external.torque), np.asarray(external.std), _CERTAIN)
             self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (
                 certain + pushed - self._taken_off
             )
-        found: Array = torque + share * (pushed - self._taken_off)
+        ahead, ddq, beside = self._dq_ref, ddq_ref, pushed - self._taken_off
+        share = np.repeat([part.share for part in self._stiffness], 3)
+        too_stiff = np.zeros(self.model.n)
+        if np.any(share < 1.0):
+            # of motion and force only their share, each in its own axes of the tip
+            less = np.linalg.pinv(J, rcond=1e-3) * (1.0 - share)
+            ahead, ddq = ahead - less @ (J @ ahead), ddq - less @ (J @ ddq)
+            beside = beside - J.T @ (less.T @ beside)
+            yields: Array = np.linalg.solve(self.model.mass_matrix(seen.q), J.T).astype(np.float64)
+            for part, axes in zip(self._stiffness, _PARTS, strict=True):
+                if part.share < 1.0:
+                    too_stiff += (1.0 - part.share) * _too_stiff(
+                        J[axes], yields[:, axes], behind, part.stiffest
+                    )
+        a = ddq + BANDWIDTH**2 * behind + 2.0 * BANDWIDTH * (ahead - seen.dq) - too_stiff
+        torque = self.model.inverse_dynamics(seen.q, seen.dq, a) + self.model.friction_torque(seen.dq)
+        found: Array = torque + beside
         return found
-
-    def _too_stiff(self, J: Array, q: Array, behind: Array) -> Array:
-        """(n,) of the joints' acceleration, what the tip's stiffness above `stiffest` has in it [rad/s^2].
-
-        The tip's stiffness is that of the position control, its effective mass (O. Khatib, IEEE J. RA 3(1), 1987)
-        times the bandwidth squared; along its own axes it is cut.
-        """
-        yields = np.linalg.solve(self.model.mass_matrix(q), J.T)
-        mobility, axes = np.linalg.eigh(J @ yields)
-        stiffness = BANDWIDTH**2 / np.maximum(mobility, 1e-9)
-        force = axes @ (np.maximum(0.0, stiffness - self._stiffest) * (axes.T @ (J @ behind)))
-        surplus: Array = yields @ force
-        return surplus
 
     def touch(self) -> Touch:
         """Everything the pipeline knows after the newest sample."""
@@ -343,6 +355,19 @@ class ArmSlave:
     def close(self) -> None:
         """Stop the drives and let go."""
         self.driver.close()
+
+
+def _too_stiff(J: Array, yields: Array, behind: Array, stiffest: float) -> Array:
+    """(n,) of the joints' acceleration, what the tip's stiffness above `stiffest` has in it [rad/s^2].
+
+    The tip's stiffness is that of the position control, its effective mass (O. Khatib, IEEE J. RA 3(1), 1987)
+    times the bandwidth squared; along its own axes it is cut. J (3, n) of place or turn, yields (n, 3) M^-1 J^T.
+    """
+    mobility, axes = np.linalg.eigh(J @ yields)
+    stiffness = BANDWIDTH**2 / np.maximum(mobility, 1e-9)
+    force = axes @ (np.maximum(0.0, stiffness - stiffest) * (axes.T @ (J @ behind)))
+    surplus: Array = yields @ force
+    return surplus
 
 
 class InScene(ArmSlave):

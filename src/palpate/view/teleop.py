@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from .._core import rotation_matrix, turn_between
 from ..arm import Array
 from ..report._style import LIGHT
 from ..report._text import escape
@@ -139,6 +140,7 @@ class TeleopPage:
             opacity=0.12,
         )
         self._handle = server.scene.add_icosphere("/device/handle", radius=0.02, color=(0, 114, 178))
+        self._stylus = server.scene.add_frame("/device/stylus", axes_length=0.08, axes_radius=0.003)
         server.scene.add_label("/device/name", "device", position=self._device + np.array([0.0, 0.0, 0.34]))
         server.scene.add_label("/slave/name", "slave", position=(0.0, 0.0, 1.3))
         self._goal = server.scene.add_icosphere("/goal", radius=0.018, color=(0, 114, 178), opacity=0.35)
@@ -273,6 +275,9 @@ class TeleopPage:
             for handle, T in zip(self._frames, link_frames(slave.model, run.q[k]), strict=True):
                 handle.wxyz, handle.position = _wxyz(T[:3, :3]), T[:3, 3]
             self._handle.position = self._device + run.device[k]
+            if slave.pose:
+                self._stylus.position = self._device + run.device[k]
+                self._stylus.wxyz = _wxyz(rotation_matrix(run.device_turn[k]))
             self._goal.position = self._tip + self._setup.motion_scale * (run.device[k] - run.device[0])
             for geom, box in self._boxes:
                 data = slave.plant.data
@@ -309,12 +314,24 @@ class TeleopPage:
             f'<div class="line">{escape(words)}</div>',
             f'<div class="line">time <b>{run.time[k]:.0f} s</b>, force true <b>{true:.1f} N</b>, '
             f"felt <b>{felt:.1f} N</b></div>",
+            *self._turned(run, k),
             f'<div class="line">delay {1e3 * f.delay:.0f} ms, jitter {1e3 * f.jitter:.0f} ms, '
             f"loss {100.0 * f.loss:.0f} %{', cut' if self.cut else ''}</div></div>",
         ]
         text = "".join(lines)
         if text != self._said:
             self._words.content = self._said = text
+
+    def _turned(self, run: Run, k: int) -> list[str]:
+        """A line on the orientation, if it is coupled."""
+        if not self._setup.slave.pose:
+            return []
+        away = np.linalg.norm(turn_between(run.wanted_turn[k], run.tip_turn[k]))
+        true, felt = np.linalg.norm(run.true_torque[k]), np.linalg.norm(run.felt_torque[k])
+        return [
+            f'<div class="line">turned away by <b>{1e3 * away:.1f} mrad</b>, torque true <b>{true:.2f} N m</b>, '
+            f"felt <b>{felt:.2f} N m</b></div>"
+        ]
 
     def close(self) -> None:
         """End the page."""
