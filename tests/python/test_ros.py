@@ -25,7 +25,7 @@ from palpate.errors import DriverError, InputError
 
 pytest.importorskip("cyclonedds", reason="ROS 2 needs the extra ros")
 
-from palpate.ros import LATCHED, Context, Node, RosArguments, RosDriver, SampleSource, messages
+from palpate.ros import LATCHED, Context, Node, RosArguments, RosDriver, SampleSource, messages, over_dds
 from palpate.ros.arguments import params_file
 from palpate.ros.graphs import GRAPHS, TASKS
 from palpate.ros.launch import Launch, graph
@@ -55,6 +55,7 @@ from palpate.ros.messages import (
 from palpate.ros.names import Remap, expand, namespace, node_name, plain_type, remapped
 from palpate.ros.parameters import Parameters
 from palpate.ros.tasks import ArmSimulation
+from palpate.ros.transport import REQUESTS
 from palpate.weigh import Task, make_pipeline, run, scene
 from ros_here import DOMAIN, TAGGED, here, palpate_ros, until
 
@@ -219,11 +220,17 @@ class TestParameters:
             answers: list[Any] = []
 
             def client(service: str, request: type[Any], reply: type[Any]) -> Any:
+                from cyclonedds.pub import DataWriter
+                from cyclonedds.sub import DataReader
+                from cyclonedds.topic import Topic
+
                 base = f"{node.full_name}/{service}"
-                how = pp.ros.Reliability(depth=100)  # type: ignore[attr-defined]
-                reader = there.reader(reply, f"rr{base}Reply", how)
+                qos = over_dds._qos(REQUESTS)
+                taker: Any = there.transport
+                party = taker.participant
+                reader = DataReader(party, Topic(party, f"rr{base}Reply", reply), qos=qos)
                 me.watch(lambda: answers.extend(reader.take(10)))
-                return there.writer(request, f"rq{base}Request", how)
+                return DataWriter(party, Topic(party, f"rq{base}Request", request), qos=qos)
 
             ask = client("list_parameters", ListParametersRequest, ListParametersReply)
             put = client("set_parameters", SetParametersRequest, SetParametersReply)
@@ -390,7 +397,7 @@ class TestSource:
         with Node("intruder", bench["there"], quiet=True) as second:
             other = second.publish(JointState, "joint_states")
             nodes = [*bench["both"], second]
-            until(nodes, lambda: other.readers and len(bench["source"].subscription.writers) == 2, "a match")
+            until(nodes, lambda: other.readers and bench["source"].subscription.writers == 2, "a match")
             for k in range(8):
                 done = bench["source"].refused + len(bench["got"]) + 2
                 other.publish(state(1000 + k, position=[9.0] * ARM.n))
@@ -410,7 +417,7 @@ class TestSource:
         with Node("again", bench["there"], quiet=True) as second:
             other = second.publish(JointState, "joint_states")
             nodes = [*bench["both"], second]
-            until(nodes, lambda: other.readers and len(bench["source"].subscription.writers) == 2, "a match")
+            until(nodes, lambda: other.readers and bench["source"].subscription.writers == 2, "a match")
             for k in range(7):
                 other.publish(state(5 + k))
             until(nodes, lambda: len(bench["got"]) + bench["source"].refused == 8, "all")
@@ -460,7 +467,7 @@ class TestGraph:
             with Node("guest", other, space="/house", arguments=arguments("-r", "__node:=visitor")) as guest:
                 guest.publish(Float64, "~/warmth")
                 until([me, guest], lambda: "/house/visitor" in there.nodes(), "the guest")
-                (end,) = there.publishers("rt/house/visitor/warmth")
+                (end,) = there.publishers("/house/visitor/warmth")
                 assert (end.node, end.type) == ("/house/visitor", "std_msgs/msg/Float64")
             until([me], lambda: there.nodes() == ["/watcher"], "its leaving")
 
@@ -787,7 +794,7 @@ class TestTasks:
             until([me], lambda: arm.spin_once(0.0) or arm._command is not None, "the command")
             with Node("second", me.context, quiet=True) as second:
                 other = second.publish(JointState, "joint_commands")
-                until([me, second], lambda: other.readers and len(arm._reader.writers) == 2, "a match")
+                until([me, second], lambda: other.readers and arm._reader.writers == 2, "a match")
                 other.publish(JointState(name=names, effort=[9.0] * 7))
                 until([me, second], lambda: arm.spin_once(0.0), "the intruder's command")
                 assert arm._command is not None and arm._command[0] == 0.5

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from types import FrameType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,6 +17,9 @@ from ..errors import InputError, suggest
 from . import STOPPED
 from ._common import Json, Quiet, emit, examples, group, say
 from ._live import interruptible
+
+if TYPE_CHECKING:
+    from ..ros import Context
 
 _ARGUMENTS = {"allow_extra_args": True, "ignore_unknown_options": True}
 
@@ -29,6 +32,15 @@ Localhost = Annotated[
     typer.Option(
         "--localhost",
         help="Stay on this machine; so do ROS_LOCALHOST_ONLY=1 and ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST.",
+    ),
+]
+
+RmwOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="RMW",
+        help="What carries messages: dds or zenoh. [default: zenoh where RMW_IMPLEMENTATION is rmw_zenoh_cpp, else dds]",
+        show_default=False,
     ),
 ]
 
@@ -50,6 +62,7 @@ def add(app: typer.Typer) -> None:
             "palpate ros run mass --ros-args -p arm:=lbr.yaml -p state_kind:=lbr_state -r joint_states:=/lbr/state",
             "palpate ros run arm_simulation --ros-args -p payload_mass:=0.4 -r __ns:=/left",
             "palpate ros run control --domain 7 --ros-args --params-file gains.yaml",
+            "palpate ros run mass --rmw zenoh --ros-args -p arm:=robot.arm.yaml",
             "palpate ros run camera --ros-args -p latched:=false -r image/compressed:=/camera/image_raw/compressed",
         ),
     )(run)
@@ -65,13 +78,14 @@ def add(app: typer.Typer) -> None:
             "palpate ros launch mass-estimation --without arm_simulation --without trajectory --without control "
             "--ros-args -p arm:=robot.arm.yaml",
             "palpate ros launch mass-estimation --restart --ros-args --params-file tuning.yaml",
+            "palpate ros launch mass-estimation --rmw zenoh",
             "palpate ros launch wiping --ros-args -p wipe:board:=3",
         ),
     )(launch)
     ros.command(
         "list",
         help="List the nodes and topics of a domain.",
-        epilog=examples("palpate ros list", "palpate ros list --domain 7 --json"),
+        epilog=examples("palpate ros list", "palpate ros list --domain 7 --json", "palpate ros list --rmw zenoh"),
     )(list_)
     ros.command(
         "echo",
@@ -102,11 +116,12 @@ def run(
     node: Annotated[str, typer.Argument(metavar="NODE", help="Which one.")],
     domain: Domain = None,
     localhost: Localhost = False,
+    rmw: RmwOption = None,
     parent: Annotated[int | None, typer.Option(hidden=True)] = None,
     quiet: Quiet = False,
 ) -> int:
     """Run one node."""
-    from ..ros import Context, RosArguments
+    from ..ros import RosArguments
     from ..ros.graphs import TASKS
 
     if node not in TASKS:
@@ -114,10 +129,10 @@ def run(
     arguments = RosArguments.parse(context.args)
     with (
         _until_asked(parent) as stop,
-        Context(domain, localhost=localhost or None, largest=TASKS[node].largest) as there,
+        _joined(domain, localhost, rmw, largest=TASKS[node].largest) as there,
         TASKS[node](there, arguments, quiet=quiet) as task,
     ):
-        task.log(f"{task.about}; domain {there.domain}")
+        task.log(f"{task.about}; domain {there.domain} over {there.rmw}")
         task.run(stop)
         return 0 if task.finished else STOPPED
 
@@ -134,10 +149,12 @@ def launch(
     ] = False,
     domain: Domain = None,
     localhost: Localhost = False,
+    rmw: RmwOption = None,
     quiet: Quiet = False,
 ) -> int:
     """Launch a graph."""
     from ..ros import RosArguments
+    from ..ros.context import check_rmw
     from ..ros.launch import Launch
     from ..ros.launch import graph as nodes_of
 
@@ -145,6 +162,7 @@ def launch(
     options = [
         *(() if domain is None else ("--domain", str(domain))),
         *(("--localhost",) if localhost else ()),
+        *(() if rmw is None else ("--rmw", check_rmw(rmw))),
     ]
     options += ["--quiet"] if quiet else []
     started = Launch(
@@ -160,11 +178,22 @@ def launch(
         return STOPPED if stop() and code == 0 else code
 
 
-def _look_around(domain: int | None, localhost: bool, seconds: float) -> tuple[list[str], dict[str, Any]]:
-    """Nodes, and the topics with their types and numbers of publishers and readers."""
-    from ..ros import Context, Node
+def _joined(domain: int | None, localhost: bool, rmw: str | None, **options: Any) -> Context:
+    """A member of the graph as the options say."""
+    from ..ros import Context
+    from ..ros.context import check_rmw
 
-    with Context(domain, localhost=localhost or None) as there, Node("palpate_list", there, quiet=True) as me:
+    chosen = None if rmw is None else check_rmw(rmw)
+    return Context(domain, localhost=localhost or None, rmw=chosen, **options)
+
+
+def _look_around(
+    domain: int | None, localhost: bool, rmw: str | None, seconds: float
+) -> tuple[list[str], dict[str, Any]]:
+    """Nodes, and the topics with their types and numbers of publishers and readers."""
+    from ..ros import Node
+
+    with _joined(domain, localhost, rmw) as there, Node("palpate_list", there, quiet=True) as me:
         own = me.full_name
         me.spin_until(lambda: False, seconds)
         nodes = [name for name in there.nodes() if name != own]
@@ -182,11 +211,12 @@ def _look_around(domain: int | None, localhost: bool, seconds: float) -> tuple[l
 def list_(
     domain: Domain = None,
     localhost: Localhost = False,
+    rmw: RmwOption = None,
     wait: Annotated[float, typer.Option(metavar="S", help="How long to look around.")] = 2.0,
     json: Json = False,
 ) -> int:
     """List nodes and topics."""
-    nodes, topics = _look_around(domain, localhost, wait)
+    nodes, topics = _look_around(domain, localhost, rmw, wait)
     if json:
         emit({"nodes": nodes, "topics": topics})
         return 0
@@ -207,9 +237,10 @@ def echo(
     count: Annotated[int, typer.Option(metavar="N", help="Stop after so many messages; 0: at Ctrl-C.")] = 0,
     domain: Domain = None,
     localhost: Localhost = False,
+    rmw: RmwOption = None,
 ) -> int:
     """Print messages."""
-    from ..ros import Context, Node, messages
+    from ..ros import Node, messages
 
     known = {m.ros_type: m for m in vars(messages).values() if hasattr(m, "ros_type")}
     printed = 0
@@ -222,12 +253,12 @@ def echo(
 
     with (
         _until_asked() as stop,
-        Context(domain, localhost=localhost or None) as there,
+        _joined(domain, localhost, rmw) as there,
         Node("palpate_echo", there) as node,
     ):
-        wire = f"rt{node.resolve(topic)}"
-        node.spin_until(lambda: stop() or bool(there.publishers(wire)))
-        types = {end.type for end in there.publishers(wire)}
+        full = node.resolve(topic)
+        node.spin_until(lambda: stop() or bool(there.publishers(full)))
+        types = {end.type for end in there.publishers(full)}
         if not types:
             return STOPPED
         name = min(types)

@@ -1,4 +1,4 @@
-"""ROS 2 without a ROS installation: messages, nodes, parameters, bridges and a driver, over Cyclone DDS.
+"""ROS 2 without a ROS installation: messages, nodes, parameters, bridges and a driver, over Cyclone DDS or Zenoh.
 
 Raises:
     MissingExtraError: on import, where ``palpate[ros]`` is not installed.
@@ -15,11 +15,12 @@ except ImportError:
 
 from . import messages
 from .arguments import RosArguments
-from .context import DEFAULT, LATCHED, SENSOR_DATA, STREAM, Context, Endpoint, Reliability
+from .context import Context
 from .driver import RosDriver, collect
 from .node import Node, Publisher, Subscription
 from .parameters import Parameters
 from .source import SampleSource
+from .transport import DEFAULT, LATCHED, SENSOR_DATA, STREAM, Endpoint, Reliability
 
 __all__ = [
     "DEFAULT",

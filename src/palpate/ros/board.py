@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError, suggest
-from .context import LATCHED, SENSOR_DATA
 from .messages import (
     CompressedImage,
     Float64,
@@ -27,6 +26,7 @@ from .messages import (
 )
 from .source import OneWriter
 from .tasks import TaskNode
+from .transport import LATCHED, SENSOR_DATA
 
 if TYPE_CHECKING:
     from ..wipe import Event, JobResult, Look, Tick

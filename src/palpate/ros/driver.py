@@ -16,10 +16,11 @@ from ..errors import DriverError
 from ..logs import Log, Sample
 from ..session import card_text
 from .arguments import RosArguments
-from .context import STREAM, Context
+from .context import Context, Rmw
 from .messages import Float64MultiArray, Header, JointState, Time
 from .node import Node, Publisher
 from .source import Kind, SampleSource, Stamp
+from .transport import STREAM
 
 CommandKind: TypeAlias = Literal["float64_multi_array", "joint_state"]
 _FAREWELL = 0.2
@@ -53,6 +54,7 @@ class RosDriver(Driver):
         patience: longest silence [s].
         domain: of ROS; None: ``ROS_DOMAIN_ID``, or 0.
         localhost: stay on this machine; None: as the environment says.
+        rmw: what carries messages, "dds" or "zenoh"; None: as the environment says.
         name: of the node.
         arguments: remappings.
 
@@ -74,6 +76,7 @@ class RosDriver(Driver):
         patience: float = 1.0,
         domain: int | None = None,
         localhost: bool | None = None,
+        rmw: Rmw | None = None,
         name: str = "palpate",
         arguments: RosArguments | None = None,
     ) -> None:
@@ -87,7 +90,7 @@ class RosDriver(Driver):
         self._topic, self._kind, self._stamp, self._sign = topic, kind, stamp, torque_sign
         self._command, self._command_kind = command, command_kind
         self._patience = float(patience)
-        self._where = (domain, localhost)
+        self._where = (domain, localhost, rmw)
         self._name, self._arguments = name, arguments
         self._limit = np.array([j.limits.effort for j in arm.joints])
         self._context: Context | None = None
@@ -117,7 +120,8 @@ class RosDriver(Driver):
         return () if self._node is None else self._node.troubles
 
     def _connect(self) -> None:
-        self._context = Context(self._where[0], localhost=self._where[1])
+        domain, localhost, rmw = self._where
+        self._context = Context(domain, localhost=localhost, rmw=rmw)
         try:
             self._node = Node(self._name, self._context, arguments=self._arguments, quiet=True)
             self._source = SampleSource(

@@ -2,7 +2,7 @@
 
 A message ``pkg/msg/T`` is the DDS type ``pkg::msg::dds_::T_``, final, in CDR version 1. Field names and order are those
 of the public interface packages (Jazzy); the hashes are those of REP-2016. The requests and replies of services carry
-the identity of their caller in front of their fields, as rmw_cyclonedds has it.
+the identity of their caller in front of their fields, as rmw_cyclonedds has it; a request knows its service's hash.
 """
 
 # no `from __future__ import annotations`: cyclonedds looks at the annotations themselves
@@ -40,14 +40,14 @@ class Malformed:
 
 
 @dataclass_transform()
-def _message(type_hash: str = "") -> Callable[[_T], _T]:
+def _message(type_hash: str = "", *, service_hash: str = "") -> Callable[[_T], _T]:
     """A final dataclass with its ROS name (``ros_type``) and hash, whose bad bytes become :class:`Malformed`."""
 
     def make(cls: _T) -> _T:
         made: Any = dataclass(annotations.final(cls))
         package, kind, _, name = made.__idl_typename__.split(".")
         made.ros_type = f"{package}/{kind}/{name.removesuffix('_')}"
-        made.type_hash = type_hash
+        made.type_hash, made.service_hash = type_hash, service_hash
         decode = made.deserialize
 
         def deserialize(data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> Any:
@@ -371,7 +371,7 @@ class ParameterEvent(IdlStruct, typename="rcl_interfaces.msg.dds_.ParameterEvent
     deleted_parameters: Parameters = field(default_factory=list)
 
 
-@_message()
+@_message(service_hash="RIHS01_3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d")
 class ListParametersRequest(IdlStruct, typename="rcl_interfaces.srv.dds_.ListParameters_Request_"):
     """Request of ``rcl_interfaces/srv/ListParameters``."""
 
@@ -390,7 +390,7 @@ class ListParametersReply(IdlStruct, typename="rcl_interfaces.srv.dds_.ListParam
     result: ListParametersResult = field(default_factory=ListParametersResult)
 
 
-@_message()
+@_message(service_hash="RIHS01_bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc")
 class GetParametersRequest(IdlStruct, typename="rcl_interfaces.srv.dds_.GetParameters_Request_"):
     """Request of ``rcl_interfaces/srv/GetParameters``."""
 
@@ -408,7 +408,7 @@ class GetParametersReply(IdlStruct, typename="rcl_interfaces.srv.dds_.GetParamet
     values: Annotated[Sequence[ParameterValue], idl.sequence(ParameterValue)] = field(default_factory=list)
 
 
-@_message()
+@_message(service_hash="RIHS01_da199c878688b3e530bdfe3ca8f74cb9fa0c303101e980a9e8f260e25e1c80ca")
 class GetParameterTypesRequest(IdlStruct, typename="rcl_interfaces.srv.dds_.GetParameterTypes_Request_"):
     """Request of ``rcl_interfaces/srv/GetParameterTypes``."""
 
@@ -426,7 +426,7 @@ class GetParameterTypesReply(IdlStruct, typename="rcl_interfaces.srv.dds_.GetPar
     types: Bytes = field(default_factory=list)
 
 
-@_message()
+@_message(service_hash="RIHS01_845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff")
 class DescribeParametersRequest(IdlStruct, typename="rcl_interfaces.srv.dds_.DescribeParameters_Request_"):
     """Request of ``rcl_interfaces/srv/DescribeParameters``."""
 
@@ -446,7 +446,7 @@ class DescribeParametersReply(IdlStruct, typename="rcl_interfaces.srv.dds_.Descr
     )
 
 
-@_message()
+@_message(service_hash="RIHS01_56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0")
 class SetParametersRequest(IdlStruct, typename="rcl_interfaces.srv.dds_.SetParameters_Request_"):
     """Request of ``rcl_interfaces/srv/SetParameters``."""
 
@@ -466,7 +466,7 @@ class SetParametersReply(IdlStruct, typename="rcl_interfaces.srv.dds_.SetParamet
     )
 
 
-@_message()
+@_message(service_hash="RIHS01_0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd")
 class SetParametersAtomicallyRequest(
     IdlStruct, typename="rcl_interfaces.srv.dds_.SetParametersAtomically_Request_"
 ):

@@ -7,12 +7,9 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Self
 
-from cyclonedds.core import DDSException, WaitSet
-from cyclonedds.util import duration
-
 from ..errors import InputError
 from .arguments import RosArguments
-from .context import DEFAULT, STREAM, Context, Endpoint, Reliability, gids, new_data
+from .context import Context
 from .messages import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -20,13 +17,13 @@ from .messages import (
     KeyValue,
     Log,
     Malformed,
-    NodeEntitiesInfo,
     Parameter,
     ParameterEvent,
     Time,
 )
 from .names import expand, remapped, renamed
 from .parameters import Parameters
+from .transport import DEFAULT, STREAM, Endpoint, Reliability, Seat, Server, full_name
 
 _HOUSEKEEPING = 0.2
 """time between two looks at what changes seldom [s]"""
@@ -36,20 +33,18 @@ _DIAGNOSTICS = 1.0
 """[s]"""
 _COMPLAINT = 10.0
 """how long messages that are none are spoken of after the last of them [s]"""
-_TAKEN = 200
-"""messages taken from a reader at a time"""
 _LEVELS = ("ok", "warning", "error")
 
 
 class Publisher:
     """Publishes messages of one type on one topic."""
 
-    def __init__(self, context: Context, message: type[Any], name: str, how: Reliability) -> None:
+    def __init__(self, seat: Seat, message: type[Any], name: str, how: Reliability) -> None:
         self.name = name
         """full name"""
         self.unsent = 0
-        """messages given up because a reader took none for 0.1 s"""
-        self._writer: Any = context.writer(message, f"rt{name}", how)
+        """messages given up because a reader took none for 0.1 s; over Zenoh nobody tells"""
+        self._writer = seat.writer(message, name, how)
 
     def publish(self, message: Any) -> None:
         """Send a message; a reader that takes none any more makes it be dropped and counted.
@@ -58,26 +53,22 @@ class Publisher:
             InputError: a field holds what its type cannot.
         """
         try:
-            self._writer.write(message)
-        except DDSException as error:
-            if error.code != DDSException.DDS_RETCODE_TIMEOUT:
-                raise
-            self.unsent += 1
+            self.unsent += not self._writer.write(message)
         except Exception as error:  # noqa: BLE001 cyclonedds raises bare ones
             raise InputError(f"{self.name}: {' '.join(str(error).split())[:200]}") from None
 
     def flush(self, timeout: float) -> bool:
-        """Wait until every reliable reader has what was sent, at most `timeout` [s]; whether they have."""
-        return bool(self._writer.wait_for_acks(duration(seconds=timeout)))
+        """Wait until every reliable reader has what was sent, at most `timeout` [s]; whether they are known to."""
+        return self._writer.flush(timeout)
 
     def close(self) -> None:
         """Publish no more; readers are told at once, whoever still holds this."""
-        self._writer = None
+        self._writer.close()
 
     @property
     def readers(self) -> int:
         """How many read it now."""
-        return len(self._writer.get_matched_subscriptions())
+        return self._writer.readers
 
 
 class Subscription:
@@ -86,11 +77,11 @@ class Subscription:
     def __init__(
         self,
         context: Context,
+        seat: Seat,
         message: type[Any],
         name: str,
         how: Reliability,
         callback: Callable[[Any, int], None],
-        attach: Callable[[Any], None],
         optional: bool = False,
     ) -> None:
         self.name = name
@@ -98,42 +89,40 @@ class Subscription:
         self.message = message
         self.malformed = 0
         """messages whose bytes were not of this type"""
-        self._context, self._how, self._attach = context, how, attach
+        self._context, self._seat, self._how = context, seat, how
         self._callback, self._optional = callback, optional
         self._malformed, self._complain_until, self._reason = 0, 0.0, ""
-        self._open()
-
-    def _open(self) -> None:
-        self._reader: Any = self._context.reader(self.message, f"rt{self.name}", self._how)
-        self._condition: Any = new_data(self._reader)
-        self._attach(self._condition)
+        self._reader = seat.reader(message, name, how)
         self._since = time.monotonic()
 
     def take(self) -> int:
         """Give what has come to the callback, with a number for its writer; how many messages that were."""
         count = 0
-        for message in self._reader.take(_TAKEN):
+        for message, writer in self._reader.take():
             if isinstance(message, Malformed):
                 self.malformed += 1
                 self._reason = self._reason or message.reason
-            elif isinstance(message, self.message):
+            else:
                 count += 1
-                handle = message.sample_info.publication_handle & 0xFFFF_FFFF_FFFF_FFFF
-                self._callback(message, handle)
+                self._callback(message, writer)
         return count
 
     def close(self) -> None:
         """Read no more."""
-        self._condition = self._reader = None
+        self._reader.close()
 
     @property
-    def writers(self) -> list[int]:
-        """A number for each writer that is known now."""
-        return [h & 0xFFFF_FFFF_FFFF_FFFF for h in self._reader.get_matched_publications()]
+    def writers(self) -> int:
+        """How many writers of this type are known now."""
+        return self._reader.writers
+
+    def alive(self, writer: int) -> bool:
+        """Whether the writer of this number may still be there."""
+        return self._reader.alive(writer)
 
     def publishers(self) -> list[Endpoint]:
         """Who publishes on this topic, of any type."""
-        return self._context.publishers(f"rt{self.name}")
+        return self._context.publishers(self.name)
 
     def look(self) -> str:
         """Take what is offered; what keeps messages away, in one line, or nothing."""
@@ -141,7 +130,7 @@ class Subscription:
         if self.malformed > self._malformed:
             self._malformed = self.malformed
             self._complain_until = now + _COMPLAINT
-        if self._reader.get_matched_publications():
+        if self.writers:
             self._since = now
             if now >= self._complain_until:
                 self._reason = ""
@@ -151,11 +140,13 @@ class Subscription:
         if self._how.reliable and any(p.type == self._type and not p.reliable for p in known):
             # a reader that insists on getting everything gets nothing from a writer that promises nothing
             self._how = Reliability(False, self._how.latched, self._how.depth)
-            self._open()
+            self._reader.close()
+            self._reader = self._seat.reader(self.message, self.name, self._how)
+            self._since = now
             return ""
         if others:
             return f"{self.name} is published as {', '.join(others)}; expected {self._type}"
-        if time.monotonic() - self._since < _ALONE or (self._optional and not known):
+        if now - self._since < _ALONE or (self._optional and not known):
             return ""
         if known:
             nodes = ", ".join(sorted({p.node or "an unnamed node" for p in known}))
@@ -164,37 +155,15 @@ class Subscription:
         where = f"nobody publishes {self.name} in domain {self._context.domain}"
         if topics:
             return f"{where}; {self._type} is on {', '.join(topics[:10])}"
-        return f"{where}, nor any {self._type}: is it another domain (ROS_DOMAIN_ID), or has it not started?"
+        return (
+            f"{where}, nor any {self._type}: is it another domain (ROS_DOMAIN_ID), or has it not started?"
+            + self._context.transport.alone()
+        )
 
     @property
     def _type(self) -> str:
         name: str = self.message.ros_type
         return name
-
-
-class _Service:
-    """Answers requests as rmw_cyclonedds has them: the caller's identity stands in front of the fields."""
-
-    def __init__(
-        self,
-        context: Context,
-        name: str,
-        request: type[Any],
-        reply: type[Any],
-        handle: Callable[[Any], Any],
-    ) -> None:
-        how = Reliability(depth=1000)
-        self.reader: Any = context.reader(request, f"rq{name}Request", how, hashed=False)
-        self.writer: Any = context.writer(reply, f"rr{name}Reply", how, hashed=False)
-        self.condition: Any = new_data(self.reader)
-        self._request, self._handle = request, handle
-
-    def serve(self) -> None:
-        for request in self.reader.take(_TAKEN):
-            if isinstance(request, self._request):
-                reply = self._handle(request)
-                reply.guid, reply.sequence = request.guid, request.sequence
-                self.writer.write(reply)
 
 
 class Node:
@@ -231,13 +200,13 @@ class Node:
         self._quiet = quiet
         self._publishers: list[Publisher] = []
         self._subscriptions: list[Subscription] = []
-        self._services: list[_Service] = []
-        self._waitset: Any = WaitSet(context.participant)
+        self._services: list[Server] = []
+        self._seat = context.transport.join(self.space, self.name)
+        self._closed = False
         self._troubles: dict[str, tuple[int, str]] = {}
         self._facts: dict[str, str] = {}
         self._watch: list[Callable[[], None]] = []
         self._next = self._next_diagnostics = 0.0
-        context.add_node(self._describe)
         self.parameters = Parameters(self.full_name, arguments.overrides)
         self.parameters.declare(
             "use_sim_time", False, "without effect: only the stamps of messages count here"
@@ -248,15 +217,12 @@ class Node:
         self.parameters.changed = self._tell_change
         for service, (request, reply, handle) in self.parameters.services().items():
             full = expand(f"~/{service}", self.space, self.name)
-            served = _Service(context, full, request, reply, handle)
-            self._services.append(served)
-            self._waitset.attach(served.condition)
-        context.announce()
+            self._services.append(self._seat.server(full, request, reply, handle))
 
     @property
     def full_name(self) -> str:
         """With its namespace."""
-        return f"{self.space.rstrip('/')}/{self.name}"
+        return full_name(self.space, self.name)
 
     def resolve(self, topic: str) -> str:
         """The full name of a topic after remapping."""
@@ -269,9 +235,8 @@ class Node:
         Raises:
             InputError: the topic's name is none.
         """
-        made = Publisher(self.context, message, self.resolve(topic), how)
+        made = Publisher(self._seat, message, self.resolve(topic), how)
         self._publishers.append(made)
-        self.context.announce()
         return made
 
     def subscribe(
@@ -291,9 +256,8 @@ class Node:
             InputError: the topic's name is none.
         """
         name = self.resolve(topic)
-        made = Subscription(self.context, message, name, how, callback, self._waitset.attach, optional)
+        made = Subscription(self.context, self._seat, message, name, how, callback, optional)
         self._subscriptions.append(made)
-        self.context.announce()
         return made
 
     def watch(self, look: Callable[[], None]) -> None:
@@ -361,7 +325,7 @@ class Node:
             self._next = now + _HOUSEKEEPING
             self._keep_house(now)
         if timeout > 0.0:
-            self._waitset.wait(duration(seconds=timeout))
+            self._seat.wait(timeout)
         count = sum(subscription.take() for subscription in self._subscriptions)
         for service in self._services:
             service.serve()
@@ -390,18 +354,16 @@ class Node:
 
     def close(self) -> None:
         """Leave the graph. Closed already: nothing happens."""
-        if self._waitset is None:
+        if self._closed:
             return
-        self.context.remove_node(self._describe)
-        self._waitset = None
-        for subscription in self._subscriptions:
-            subscription.close()
-        for publisher in self._publishers:
-            publisher.close()
+        self._closed = True
+        endpoints: list[Any] = [*self._subscriptions, *self._publishers, *self._services]
+        for endpoint in endpoints:
+            endpoint.close()
         self._subscriptions.clear()
         self._publishers.clear()
         self._services.clear()
-        del self._diagnostics, self._rosout, self._events
+        self._seat.leave()
         self.parameters.changed = lambda _: None
 
     def __enter__(self) -> Self:
@@ -409,11 +371,6 @@ class Node:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _describe(self) -> NodeEntitiesInfo:
-        readers: list[Any] = [s._reader for s in self._subscriptions] + [s.reader for s in self._services]
-        writers: list[Any] = [p._writer for p in self._publishers] + [s.writer for s in self._services]
-        return NodeEntitiesInfo(self.space, self.name, gids(readers), gids(writers))
 
 
 def together(nodes: Sequence[Node], done: Callable[[], bool], timeout: float) -> bool:

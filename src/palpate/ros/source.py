@@ -10,9 +10,9 @@ import numpy as np
 from ..arm import Array
 from ..errors import InputError
 from ..logs import Sample
-from .context import STREAM, Reliability
 from .messages import JointState, LBRState
 from .node import Node, Subscription
+from .transport import STREAM, Reliability
 
 Kind: TypeAlias = Literal["joint_state", "lbr_state"]
 Stamp: TypeAlias = Literal["header", "arrival"]
@@ -58,7 +58,7 @@ class OneWriter:
 
     def _take_over(self, writer: int) -> bool:
         """Whether a writer that was not followed before may be."""
-        known = bool(self._writer) and self._writer in self._subscription.writers
+        known = bool(self._writer) and self._subscription.alive(self._writer)
         if known and writer != self._rival:
             self._rival, self._heard = writer, 0
         self._heard += 1
@@ -70,8 +70,8 @@ class OneWriter:
 
     def _settle(self) -> None:
         """Go on when one of two writers is gone."""
-        writers = self._subscription.writers if self._torn else []
-        if self._torn and not {self._writer, self._rival} <= set(writers):
+        alive = self._subscription.alive
+        if self._torn and not (alive(self._writer) and alive(self._rival)):
             self._torn = False
             self._rival = self._heard = 0
             self._node.trouble(f"{self._subscription.name} publishers", "")

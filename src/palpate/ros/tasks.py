@@ -25,7 +25,7 @@ from ..pipeline import ESTIMATORS, OBSERVERS, Pipeline, Touch
 from ..weigh import Scene, Task, brick, check_mass, find_pose, load_arm, scene, simulated_driver
 from ..weigh.scenes import gains_at, parse_effort
 from .arguments import RosArguments
-from .context import LARGEST, Context
+from .context import Context
 from .messages import (
     Float64,
     Header,
@@ -41,6 +41,7 @@ from .messages import (
 )
 from .node import Node, Publisher
 from .source import KINDS, STAMPS, OneWriter, SampleSource
+from .transport import LARGEST
 
 _Message = TypeVar("_Message")
 _RESEND = 0.25
