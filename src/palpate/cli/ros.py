@@ -39,7 +39,7 @@ RmwOption = Annotated[
     str | None,
     typer.Option(
         metavar="RMW",
-        help="What carries messages: dds or zenoh. [default: zenoh where RMW_IMPLEMENTATION is rmw_zenoh_cpp, else dds]",
+        help="What carries messages: dds or zenoh. [default: zenoh if RMW_IMPLEMENTATION is rmw_zenoh_cpp, else dds]",
         show_default=False,
     ),
 ]
@@ -85,7 +85,9 @@ def add(app: typer.Typer) -> None:
     ros.command(
         "list",
         help="List the nodes and topics of a domain.",
-        epilog=examples("palpate ros list", "palpate ros list --domain 7 --json", "palpate ros list --rmw zenoh"),
+        epilog=examples(
+            "palpate ros list", "palpate ros list --domain 7 --json", "palpate ros list --rmw zenoh"
+        ),
     )(list_)
     ros.command(
         "echo",

@@ -91,13 +91,15 @@ class Context:
         self.rmw: Rmw = default_rmw() if rmw is None else check_rmw(rmw)
         self.transport: Transport
         if self.rmw == "zenoh":
-            from .over_zenoh import ZenohTransport
+            from . import over_zenoh
 
-            self.transport = ZenohTransport(self.domain, largest)
+            self.transport = over_zenoh.member(self.domain, largest)
         else:
-            from .over_dds import DdsTransport
+            from . import over_dds
 
-            self.transport = DdsTransport(self.domain, _local() if localhost is None else localhost, largest)
+            self.transport = over_dds.member(
+                self.domain, _local() if localhost is None else localhost, largest
+            )
         self._closed = False
 
     def nodes(self) -> list[str]:

@@ -173,7 +173,7 @@ class _Server(Server):
 
 
 class _Seat(Seat):
-    def __init__(self, transport: DdsTransport, space: str, name: str) -> None:
+    def __init__(self, transport: _Transport, space: str, name: str) -> None:
         self._transport = transport
         self._space, self._name = space, name
         self._waitset = WaitSet(transport.participant)
@@ -203,9 +203,7 @@ class _Seat(Seat):
         self._transport.announce()
         return made
 
-    def server(
-        self, name: str, request: type[Any], reply: type[Any], handle: Callable[[Any], Any]
-    ) -> Server:
+    def server(self, name: str, request: type[Any], reply: type[Any], handle: Callable[[Any], Any]) -> Server:
         requests = self._read(request, f"rq{name}Request", _qos(REQUESTS))
         return _Server(requests, self._write(reply, f"rr{name}Reply", _qos(REQUESTS)), handle)
 
@@ -222,18 +220,7 @@ class _Seat(Seat):
         )
 
 
-class DdsTransport(Transport):
-    """A participant of a domain.
-
-    Args:
-        domain: its number.
-        localhost: stay on this machine.
-        largest: messages larger than this are dropped before they are put together [kB].
-
-    Raises:
-        InputError: this process has the domain open with another `localhost` or `largest`, or DDS does not start.
-    """
-
+class _Transport(Transport):
     def __init__(self, domain: int, localhost: bool, largest: int) -> None:
         super().__init__()
         self._domain = domain
@@ -344,3 +331,17 @@ def _number(handle: int) -> int:
 
 def _alive(sample: Any) -> bool:
     return bool(sample.sample_info.instance_state == InstanceState.Alive)
+
+
+def member(domain: int, localhost: bool, largest: int) -> Transport:
+    """A participant of a domain.
+
+    Args:
+        domain: its number.
+        localhost: stay on this machine.
+        largest: messages larger than this are dropped before they are put together [kB].
+
+    Raises:
+        InputError: this process has the domain open with another `localhost` or `largest`, or DDS does not start.
+    """
+    return _Transport(domain, localhost, largest)

@@ -24,7 +24,6 @@ from .messages import Malformed
 from .names import plain_type
 from .transport import (
     BLOCKED,
-    LARGEST,
     REQUESTS,
     TAKEN,
     Endpoint,
@@ -64,8 +63,10 @@ _HEAD = 4
 
 
 def _settings(largest: int) -> dict[str, Any]:
-    """As rmw_zenoh_cpp's session by default: this machine alone, a router known by its port; here peers without a router
-    find each other too, by multicast that does not leave the machine either."""
+    """As rmw_zenoh_cpp's session by default: this machine alone, and a router known by its port.
+
+    Beyond that, peers without a router find each other, by multicast that does not leave the machine either.
+    """
     congestion = "transport/link/tx/queue/congestion_control/drop"
     return {
         "mode": "peer",
@@ -82,8 +83,8 @@ def _settings(largest: int) -> dict[str, Any]:
     }
 
 
-def configuration(largest: int = LARGEST) -> zenoh.Config:
-    """A session's: that of ``ZENOH_SESSION_CONFIG_URI`` or palpate's own, with ``ZENOH_CONFIG_OVERRIDE`` (key=value;...).
+def _configuration(largest: int) -> zenoh.Config:
+    """Palpate's own, or that of ``ZENOH_SESSION_CONFIG_URI``, with ``ZENOH_CONFIG_OVERRIDE`` (key=value;key=value).
 
     Raises:
         InputError: one of the two is wrong; the message says which key.
@@ -187,7 +188,8 @@ class _Origin(NamedTuple):
         raw = bytes(attachment) if attachment is not None else b""
         if len(raw) != 33 or raw[16] != 16:
             return None
-        return cls(*struct.unpack_from("<qq", raw), raw[17:])
+        sequence, written = struct.unpack_from("<qq", raw)
+        return cls(sequence, written, raw[17:])
 
     def pack(self) -> bytes:
         return struct.pack("<qqB", self.sequence, self.source_timestamp, 16) + self.gid
@@ -375,7 +377,7 @@ class _Server(Server):
 
 
 class _Seat(Seat):
-    def __init__(self, transport: ZenohTransport, space: str, name: str) -> None:
+    def __init__(self, transport: _Transport, space: str, name: str) -> None:
         self.transport = transport
         self._id = next(transport.ids)
         self._names = f"%/{_mangled(space)}/{name}"  # no enclave
@@ -396,9 +398,7 @@ class _Seat(Seat):
         self.transport.claim(name, message)
         return _Reader(self, message, name, how)
 
-    def server(
-        self, name: str, request: type[Any], reply: type[Any], handle: Callable[[Any], Any]
-    ) -> Server:
+    def server(self, name: str, request: type[Any], reply: type[Any], handle: Callable[[Any], Any]) -> Server:
         return _Server(self, name, request, reply, handle)
 
     def wake(self) -> None:
@@ -413,23 +413,13 @@ class _Seat(Seat):
         self._token.undeclare()
 
 
-class ZenohTransport(Transport):
-    """A session of Zenoh, and what its graph tells of a domain.
-
-    Args:
-        domain: its number.
-        largest: messages larger than this are dropped before they are put together [kB].
-
-    Raises:
-        InputError: the session does not open, or its settings in the environment are wrong.
-    """
-
+class _Transport(Transport):
     def __init__(self, domain: int, largest: int) -> None:
         super().__init__()
         self.domain = domain
         self._largest = largest * 1024
         try:
-            self.session = zenoh.open(configuration(largest))
+            self.session = zenoh.open(_configuration(largest))
         except zenoh.ZError as error:
             raise InputError(
                 f"Zenoh does not start: {_one_line(error)}; see ZENOH_CONFIG_OVERRIDE and ZENOH_SESSION_CONFIG_URI"
@@ -498,3 +488,16 @@ class ZenohTransport(Transport):
     def close(self) -> None:
         self._graph.undeclare()
         self.session.close()
+
+
+def member(domain: int, largest: int) -> Transport:
+    """A session of Zenoh, and what the graph of a domain tells.
+
+    Args:
+        domain: its number.
+        largest: messages larger than this are dropped before they are put together [kB].
+
+    Raises:
+        InputError: the session does not open, or its settings in the environment are wrong.
+    """
+    return _Transport(domain, largest)

@@ -1,7 +1,7 @@
 """What a node needs of whatever carries messages; DDS and Zenoh each offer it.
 
-A *seat* is a node's place in the graph: through it the node publishes, reads, serves, and waits. Names are full names of
-ROS (``/joint_states``) throughout; how they look on the wire is each transport's own.
+A *seat* is a node's place in the graph: through it the node publishes, reads, serves, and waits. Names are full names
+of ROS (``/joint_states``) throughout; how they look on the wire is each transport's own.
 """
 
 from __future__ import annotations
@@ -134,9 +134,7 @@ class Seat(ABC):
         """
 
     @abstractmethod
-    def server(
-        self, name: str, request: type[Any], reply: type[Any], handle: Callable[[Any], Any]
-    ) -> Server:
+    def server(self, name: str, request: type[Any], reply: type[Any], handle: Callable[[Any], Any]) -> Server:
         """A service: `handle` makes the reply to a request."""
 
     @abstractmethod
@@ -162,9 +160,7 @@ class Transport(ABC):
         """
         known: Any = self._types.setdefault(name, message)
         if known is not message:
-            raise InputError(
-                f"topic {name} is {known.ros_type} in this process, not {message.ros_type}"
-            )
+            raise InputError(f"topic {name} is {known.ros_type} in this process, not {message.ros_type}")
 
     @abstractmethod
     def join(self, space: str, name: str) -> Seat:
