@@ -11,6 +11,7 @@ import hashlib
 import itertools
 import json
 import os
+import re
 import struct
 import sys
 import threading
@@ -46,6 +47,7 @@ except ImportError:
 Kind: TypeAlias = Literal["NN", "MP", "MS", "SS"]
 
 _GRAPH = "@ros2_lv"
+_WHERE = re.compile(r" at \S+\.rs:\d+\.?")  # of Zenoh's own source
 _ROUTER = "tcp/localhost:7447"
 _HEARTBEAT = 0.5
 """of a latched writer, so that a reader knows whether it has the newest [s]"""
@@ -94,7 +96,7 @@ def _configuration(largest: int) -> zenoh.Config:
         try:
             made = zenoh.Config.from_file(path)
         except zenoh.ZError as error:
-            raise InputError(f"ZENOH_SESSION_CONFIG_URI: {_one_line(error)}") from None
+            raise InputError(f"ZENOH_SESSION_CONFIG_URI: {path}: {_one_line(error)}") from None
     else:
         made = zenoh.Config()
         for key, value in _settings(largest).items():
@@ -113,7 +115,8 @@ def _configuration(largest: int) -> zenoh.Config:
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+    text = " ".join(str(error).split())
+    return _WHERE.sub("", text)[:200]
 
 
 # --- names -------------------------------------------------------------------------------------------------------
@@ -186,7 +189,7 @@ class _Origin(NamedTuple):
     def parse(cls, attachment: Any) -> _Origin | None:
         """None: that is no attachment of ROS. Two numbers of 64 bits, the length of the identity, the identity."""
         raw = bytes(attachment) if attachment is not None else b""
-        if len(raw) != 33 or raw[16] != 16:
+        if len(raw) != 33 or raw[16] != 16 or not any(raw[17:]):
             return None
         sequence, written = struct.unpack_from("<qq", raw)
         return cls(sequence, written, raw[17:])

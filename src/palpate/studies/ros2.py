@@ -1,6 +1,7 @@
-"""ROS 2 beside DDS that nobody here wrote: every message there and back; the published graph as processes.
+"""ROS 2 beside software that nobody here wrote: every message there and back; the published graph as processes.
 
-Builds and runs the peers of ``benchmarks/ros2`` in the source tree: Fast DDS (C++) and ros2-client on RustDDS (Rust).
+Builds and runs the peers of ``benchmarks/ros2`` in the source tree: Fast DDS (C++), ros2-client on RustDDS (Rust) and,
+over Zenoh, hiroz (Rust).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 
 from ..errors import InputError, PalpateError
 from ..ros import Context, Node, Reliability
+from ..ros.context import Rmw
 from ..ros.graphs import GRAPHS, TASKS
 from ..ros.launch import Launch, graph
 from ..ros.messages import Header, InertiaStamped, JointState, JointTrajectory, Time
@@ -47,6 +49,10 @@ _DEEP = Reliability(depth=10_000)
 """so that a busy machine may stop either side for seconds"""
 _PATIENCE = 60.0
 """for a match, an answer, a mass [s]"""
+_SCOUTING = {
+    "ZENOH_CONFIG_OVERRIDE": 'scouting/multicast/enabled=true;scouting/multicast/interface="lo";connect/endpoints=[]'
+}
+"""for a peer over Zenoh: find each other on this machine without a router, as palpate does"""
 _JOINTS = tuple(f"joint_{k}" for k in range(1, 8))
 
 
@@ -101,18 +107,34 @@ def build_rust(tree: Path, folder: Path) -> Path:
         InputError: this is no clone, or cargo is missing.
         PalpateError: it does not build.
     """
-    manifest = _sources(tree) / "rust_peer" / "Cargo.toml"
+    return _built_by_cargo(tree, folder, "rust_peer", "the ros2-client peer")
+
+
+def build_zenoh(tree: Path, folder: Path) -> Path:
+    """Build the hiroz peer into a folder; its program. The first time takes minutes, and a network.
+
+    Raises:
+        InputError: this is no clone, or cargo is missing.
+        PalpateError: it does not build.
+    """
+    return _built_by_cargo(tree, folder, "zenoh_peer", "the hiroz peer")
+
+
+def _built_by_cargo(tree: Path, folder: Path, name: str, what: str) -> Path:
+    manifest = _sources(tree) / name / "Cargo.toml"
     cargo = shutil.which("cargo")
     if cargo is None:
-        raise InputError("the ros2-client peer needs Rust's cargo 1.85 or later: https://rustup.rs")
+        raise InputError(f"{what} needs Rust's cargo 1.85 or later: https://rustup.rs")
     command = [cargo, "build", "--release", "--quiet", "--manifest-path", str(manifest)]
-    _compiled(command, "the ros2-client peer", {"CARGO_TARGET_DIR": str(folder)})
-    return folder / "release" / "rust_peer"
+    _compiled(command, what, {"CARGO_TARGET_DIR": str(folder)})
+    return folder / "release" / name
 
 
 @contextmanager
 def _running(program: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    peer = subprocess.Popen([str(program), *arguments], stdout=subprocess.PIPE, text=True)
+    peer = subprocess.Popen(
+        [str(program), *arguments], stdout=subprocess.PIPE, text=True, env={**os.environ, **_SCOUTING}
+    )
     try:
         assert peer.stdout is not None
         if peer.stdout.readline() != "up\n":
@@ -142,7 +164,25 @@ class Stream(NamedTuple):
     """sent more than a period late: what this machine did meanwhile"""
 
 
-def stream(program: Path, domain: int, rate: float, seconds: float, *, localhost: bool) -> Stream:
+class Peer(NamedTuple):
+    """Software that sends messages back."""
+
+    name: str
+    build: Callable[[Path, Path], Path]
+    rmw: Rmw = "dds"
+    localhost: bool = True
+
+
+PEERS = (
+    Peer("Fast DDS (C++)", build_fastdds),
+    Peer("ros2-client on RustDDS (Rust)", build_rust, localhost=False),
+    Peer("hiroz over Zenoh (Rust)", build_zenoh, "zenoh"),
+)
+
+
+def stream(
+    program: Path, domain: int, rate: float, seconds: float, *, rmw: Rmw = "dds", localhost: bool = True
+) -> Stream:
     """Send JointStates of seven joints to a peer's echo at `rate` [Hz].
 
     Raises:
@@ -171,7 +211,7 @@ def stream(program: Path, domain: int, rate: float, seconds: float, *, localhost
     values = [0.1 * k for k in range(len(_JOINTS))]
     with (
         _running(program, "echo", str(domain), topic) as peer,
-        Context(domain, localhost=localhost) as there,
+        Context(domain, localhost=localhost, rmw=rmw) as there,
         Node("palpate_bench", there, quiet=True) as node,
     ):
         out = node.publish(JointState, topic, _DEEP)
@@ -231,7 +271,10 @@ def weigh_by_graph(domain: int, seconds: float, seed: int) -> tuple[float, float
     arm = scene(load_arm("justina_left_arm"))
     masses: list[float] = []
     readers = 1 + sum(TASKS[node].reads_samples for node in GRAPHS["mass-estimation"])
-    with Context(domain, localhost=True) as there, Node("palpate_bench", there, quiet=True) as node:
+    with (
+        Context(domain, localhost=True, rmw="dds") as there,
+        Node("palpate_bench", there, quiet=True) as node,
+    ):
         node.subscribe(JointState, "joint_states", lambda m, w: None)
         node.subscribe(InertiaStamped, "payload", lambda m, w: masses.append(m.inertia.m))
         simulation = {"pace": 0.0, "duration": seconds, "seed": seed, "wait_for": readers}
@@ -285,7 +328,10 @@ def kill_each(domain: int) -> dict[str, float]:
     def known() -> bool:
         return len(recent) >= 100 and all(abs(m - truth) <= 0.05 * truth for m in recent[-100:])
 
-    with Context(domain, localhost=True) as there, Node("palpate_bench", there, quiet=True) as node:
+    with (
+        Context(domain, localhost=True, rmw="dds") as there,
+        Node("palpate_bench", there, quiet=True) as node,
+    ):
         node.subscribe(InertiaStamped, "payload", lambda m, w: recent.append(m.inertia.m))
         for name, topic in _ANSWERS.items():
             message = JointTrajectory if name == "trajectory" else JointState
@@ -326,7 +372,7 @@ def _replaced(launched: Launch, name: str, before: int) -> Callable[[], bool]:
 
 
 def _where(domain: int) -> list[str]:
-    return ["--domain", str(domain), "--localhost", "--quiet"]
+    return ["--domain", str(domain), "--localhost", "--rmw", "dds", "--quiet"]
 
 
 # --- both --------------------------------------------------------------------------------------------------------
@@ -338,14 +384,10 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
     domain = 1 + os.getpid() % 100
     rows: list[Row] = []
     tree = source_tree()
-    peers = (
-        ("Fast DDS (C++)", build_fastdds, True),
-        ("ros2-client on RustDDS (Rust)", build_rust, False),
-    )
-    steps = len(peers) * len(RATES) + 2
+    steps = len(PEERS) * len(RATES) + 2
     done = 0
     progress(done, steps, math.inf)
-    for name, build, localhost in peers:
+    for name, build, rmw, localhost in PEERS:
         try:
             program = build(tree, tree / "build" / "peers" / build.__name__.removeprefix("build_"))
         except PalpateError as error:
@@ -355,9 +397,8 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
             done += len(RATES)
             continue
         for rate in RATES:
-            rows += stream_rows(
-                name, stream(program, domain, rate, seconds, localhost=localhost), rate, seconds
-            )
+            found = stream(program, domain, rate, seconds, rmw=rmw, localhost=localhost)
+            rows += stream_rows(name, found, rate, seconds)
             done += 1
             progress(done, steps, math.inf)
     told_mass, alone = weigh_by_graph(domain, 6.0 if quick else WEIGHING, seed=1)
