@@ -26,7 +26,7 @@ import test_ros_peers as peers
 from palpate.cli import main
 from palpate.errors import InputError
 from palpate.logs import Sample
-from palpate.ros import LATCHED, Context, Node, RosArguments, SampleSource
+from palpate.ros import LATCHED, SENSOR_DATA, Context, Node, Reliability, RosArguments, SampleSource
 from palpate.ros.graphs import TASKS
 from palpate.ros.messages import Float64, Header, InertiaStamped, JointState, Time
 from palpate.ros.over_zenoh import _Origin, _Token
@@ -177,8 +177,6 @@ class TestWire:
         hearing.undeclare()
 
     def test_what_the_graph_tells(self, me: Node, session: Any) -> None:
-        from palpate.ros import SENSOR_DATA
-
         me.publish(Float64, "/latched", LATCHED)
         me.subscribe(Float64, "fast", lambda m, w: None, SENSOR_DATA)
         found: list[str] = []
@@ -216,6 +214,27 @@ class TestWire:
         telling.undeclare()
         until([me], lambda: not taking.writers, "its leaving")
         assert not taking.alive(got[0][1])
+
+    def test_what_is_missing_is_counted(self, me: Node, session: Any) -> None:
+        """By the numbers of the messages, each writer's for itself; and what came faster than it was taken."""
+        got: list[float] = []
+        taking = me.subscribe(Float64, "/x", lambda m, w: got.append(m.data), Reliability(depth=4))
+        key = f"{DOMAIN}/x/{FLOAT64}"
+        telling = session.liveliness().declare_token(
+            f"@ros2_lv/{DOMAIN}/5e/0/1/MP/%/%/mouth/%x/{FLOAT64}/::,10:,:,:,,"
+        )
+        until([me], lambda: taking.writers, "the writer")
+        for count, (number, gid) in enumerate(
+            [(7, GID), (8, GID), (12, GID), (3, GID[::-1]), (5, GID[::-1]), (13, GID)], 1
+        ):
+            session.put(key, TWO_AND_A_HALF, attachment=beside(number, gid))
+            until([me], lambda count=count: len(got) == count, "a number")
+        assert taking.missed == 4
+        until([me], lambda: me._facts.get("missed") == "4", "the diagnostics")
+        for number in range(14, 24):
+            session.put(key, TWO_AND_A_HALF, attachment=beside(number))
+        until([me], lambda: len(got) + taking.missed == 20, "the rest")
+        telling.undeclare()
 
     def test_what_is_asked(self, me: Node, session: Any) -> None:
         """``ros2 param get`` byte by byte, and questions that are none."""

@@ -91,6 +91,7 @@ class Subscription:
         """messages whose bytes were not of this type"""
         self._context, self._seat, self._how = context, seat, how
         self._callback, self._optional = callback, optional
+        self.latched = how.latched
         self._malformed, self._complain_until, self._reason = 0, 0.0, ""
         self._reader = seat.reader(message, name, how)
         self._since = time.monotonic()
@@ -119,6 +120,14 @@ class Subscription:
     def alive(self, writer: int) -> bool:
         """Whether the writer of this number may still be there."""
         return self._reader.alive(writer)
+
+    @property
+    def missed(self) -> int:
+        """Messages that are known to be lost on the way, or because they came faster than they were taken.
+
+        DDS tells of none.
+        """
+        return self._reader.missed
 
     def publishers(self) -> list[Endpoint]:
         """Who publishes on this topic, of any type."""
@@ -339,6 +348,10 @@ class Node:
         unsent = sum(publisher.unsent for publisher in self._publishers)
         if unsent:
             self.fact("unsent", unsent)
+        # what is latched is lost by being replaced: only the newest was asked for
+        missed = sum(subscription.missed for subscription in self._subscriptions if not subscription.latched)
+        if missed:
+            self.fact("missed", missed)
         if now >= self._next_diagnostics:
             self._next_diagnostics = now + _DIAGNOSTICS
             self._tell_diagnostics()

@@ -259,7 +259,8 @@ class _Reader(Reader):
         self.place = _Place(name, _dds_type(message), message.type_hash)
         self._seat, self._message = seat, message
         self._waiting: deque[tuple[bytes, _Origin] | Malformed] = deque(maxlen=how.depth)
-        self._heard: dict[int, None] = {}
+        self._heard: dict[int, int] = {}  # number of a writer and of its newest message
+        self._missed = 0
         transport = seat.transport
         key, hear = self.place.key(transport.domain), Callback(self._hear, indirect=False)
         self._subscriber: Any
@@ -281,6 +282,7 @@ class _Reader(Reader):
         """In a thread of Zenoh's."""
         if sample.kind != zenoh.SampleKind.PUT:
             return
+        self._missed += len(self._waiting) == self._waiting.maxlen
         self._waiting.append(self._checked(sample))
         self._seat.wake()
 
@@ -290,8 +292,9 @@ class _Reader(Reader):
         origin = _Origin.parse(sample.attachment)
         if origin is None:
             return Malformed("what rmw_zenoh_cpp puts beside a message is missing")
-        self._heard.pop(origin.number, None)
-        self._heard[origin.number] = None
+        newest = self._heard.pop(origin.number, origin.sequence)
+        self._missed += max(origin.sequence - newest - 1, 0)
+        self._heard[origin.number] = max(newest, origin.sequence)
         if len(self._heard) > _HEARD:
             self._heard.pop(next(iter(self._heard)))
         return sample.payload.to_bytes(), origin
@@ -315,6 +318,10 @@ class _Reader(Reader):
     @property
     def writers(self) -> int:
         return self._seat.transport.count("MP", self.place)
+
+    @property
+    def missed(self) -> int:
+        return self._missed
 
     def alive(self, writer: int) -> bool:
         # Which token is whose is each implementation's own affair. But as many writers can be alive as there are

@@ -93,6 +93,11 @@ class Reader(ABC):
     def writers(self) -> int:
         """How many write it now."""
 
+    @property
+    @abstractmethod
+    def missed(self) -> int:
+        """Messages that are known to be lost on the way, or because they came faster than they were taken."""
+
     @abstractmethod
     def alive(self, writer: int) -> bool:
         """Whether the writer of this number may still be there."""

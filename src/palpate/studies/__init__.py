@@ -148,7 +148,11 @@ _ALL = (
     ),
     Study("session", "The real-time session at 1 kHz while the computer is busy", "bench", timed=True),
     Study("view", "The live page: first picture, updates, memory", "bench", timed=True),
-    Study("ros2", "ROS 2 beside Fast DDS and ros2-client; the published graph as processes", "bench"),
+    Study(
+        "ros2",
+        "ROS 2 beside Fast DDS, ros2-client and hiroz (Zenoh); the published graph as processes",
+        "bench",
+    ),
     Study(
         "servos",
         "Seven emulated Dynamixel servos weigh: rate, damaged answers, a dead servo",
