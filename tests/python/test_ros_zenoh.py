@@ -392,7 +392,9 @@ class TestSettings:
                 # the way past the router may still be making
                 until([a, b], lambda: (out.publish(Float64(3.0)), got)[1], "a message")
 
-    def test_where_nobody_is(self, me: Node) -> None:
+    def test_where_nobody_is(self, me: Node, capfd: pytest.CaptureFixture[str]) -> None:
+        assert main(["ros", "list", "--wait", "0", "--domain", "101", "--rmw", "zenoh"]) == 0
+        assert "no nodes: is it another domain" in capfd.readouterr().out
         assert "no Zenoh router at tcp/localhost:7447" in me.context.transport.alone()
         with here():
             until([me], lambda: not me.context.transport.alone(), "a peer")

@@ -191,8 +191,8 @@ def _joined(domain: int | None, localhost: bool, rmw: str | None, **options: Any
 
 def _look_around(
     domain: int | None, localhost: bool, rmw: str | None, seconds: float
-) -> tuple[list[str], dict[str, Any]]:
-    """Nodes, and the topics with their types and numbers of publishers and readers."""
+) -> tuple[list[str], dict[str, Any], str]:
+    """Nodes, the topics with their types and numbers of publishers and readers, and why there may be none."""
     from ..ros import Node
 
     with _joined(domain, localhost, rmw) as there, Node("palpate_list", there, quiet=True) as me:
@@ -207,7 +207,8 @@ def _look_around(
                     found[what] += 1
                     if end.type not in found["types"]:
                         found["types"].append(end.type)
-    return nodes, dict(sorted(topics.items()))
+        alone = there.transport.alone()
+    return nodes, dict(sorted(topics.items())), alone
 
 
 def list_(
@@ -218,11 +219,11 @@ def list_(
     json: Json = False,
 ) -> int:
     """List nodes and topics."""
-    nodes, topics = _look_around(domain, localhost, rmw, wait)
+    nodes, topics, alone = _look_around(domain, localhost, rmw, wait)
     if json:
         emit({"nodes": nodes, "topics": topics})
         return 0
-    say("nodes" if nodes else "no nodes: is it another domain, or are they on another network?")
+    say("nodes" if nodes else f"no nodes: is it another domain, or are they on another network?{alone}")
     for name in nodes:
         say(f"  {name}")
     if topics:
