@@ -38,7 +38,7 @@ from palpate.ros import (
     Subscription,
 )
 from palpate.ros.graphs import TASKS
-from palpate.ros.messages import Float64, Header, InertiaStamped, JointState, Time
+from palpate.ros.messages import Float64, Header, InertiaStamped, JointState, KeyValue, Time
 from palpate.ros.over_zenoh import _Origin, _Token
 from palpate.studies.ros2 import build_zenoh
 from ros_here import DOMAIN, here, palpate_ros, until
@@ -209,6 +209,10 @@ class TestWire:
         assert kinds["%latched"] == "MP" and kinds["%fast"] == "MS" and kinds["%me%get_parameters"] == "SS"
         assert f"@ros2_lv/{DOMAIN}/{zid}/0/0/NN/%/%/me" in found
         assert any(key.endswith(f"%me%get_parameters/{GET_PARAMETERS}/::,10:,:,:,,") for key in found)
+
+    def test_a_part_of_messages_is_none(self, me: Node) -> None:
+        with pytest.raises(InputError, match="/x: diagnostic_msgs/msg/KeyValue is a part"):
+            me.publish(KeyValue, "/x")
 
     def test_what_is_taken(self, me: Node, session: Any) -> None:
         got: list[tuple[float, int]] = []

@@ -165,6 +165,15 @@ class _Place(NamedTuple):
     type: str
     hash: str
 
+    @classmethod
+    def of(cls, name: str, message: Any) -> _Place:
+        """Of a topic."""
+        if not message.type_hash:
+            raise InputError(
+                f"{name}: {message.ros_type} is a part of messages, not one to be sent by itself"
+            )
+        return cls(name, _dds_type(message), message.type_hash)
+
     def key(self, domain: int) -> str:
         return f"{domain}/{self.name.strip('/')}/{self.type}/{self.hash}"
 
@@ -214,7 +223,7 @@ def _cdr(message: Any) -> bytes:
 class _Writer(Writer):
     def __init__(self, seat: _Seat, message: Any, name: str, how: Reliability) -> None:
         self._seat = seat
-        self._place = _Place(name, _dds_type(message), message.type_hash)
+        self._place = _Place.of(name, message)
         transport = seat.transport
         options: dict[str, Any] = {
             "congestion_control": zenoh.CongestionControl.DROP,  # after having waited, see _settings
@@ -256,7 +265,7 @@ class _Writer(Writer):
 
 class _Reader(Reader):
     def __init__(self, seat: _Seat, message: Any, name: str, how: Reliability) -> None:
-        self.place = _Place(name, _dds_type(message), message.type_hash)
+        self.place = _Place.of(name, message)
         self._seat, self._message = seat, message
         self._waiting: deque[tuple[bytes, _Origin] | Malformed] = deque(maxlen=how.depth)
         self._heard: dict[int, int] = {}  # number of a writer and of its newest message
