@@ -67,9 +67,10 @@ class TestWatching:
         with UrDriver(ARM, HOST) as driver:
             stamps = [following(driver).time_ns]
             before = driver.lost
-            stamps += [s.time_ns for s in (driver.read() for _ in range(200)) if s is not None]
+            # however few of them a busy computer takes up in time
+            stamps += [following(driver).time_ns for _ in range(100)]
             steps = np.diff(stamps)
-            assert len(stamps) > 10 and np.all(steps > 0)
+            assert len(stamps) > 100 and np.all(steps > 0)
             np.testing.assert_allclose(steps / 2e6, np.rint(steps / 2e6), atol=1e-3)
             assert driver.lost - before == np.rint(steps / 2e6).sum() - len(steps)
 
