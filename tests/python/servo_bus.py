@@ -51,16 +51,16 @@ class World:
         self.held = True
         self.speed = 0.0
         """of all joints, without a plant [rad/s]"""
-        self._last = time.monotonic_ns()
+        self.last_ns = time.monotonic_ns()
 
     def advance(self) -> None:
         now = time.monotonic_ns()
         if self.speed:
-            self.q = self.q + 1e-9 * (now - self._last) * self.speed
-        if self.plant is not None and not self.held and now > self._last:
-            self.plant.step(self.torque, now - self._last)
+            self.q = self.q + 1e-9 * (now - self.last_ns) * self.speed
+        if self.plant is not None and not self.held and now > self.last_ns:
+            self.plant.step(self.torque, now - self.last_ns)
             self.q, self.dq = self.plant.q, self.plant.dq
-        self._last = now
+        self.last_ns = now
 
 
 class ServoBus:

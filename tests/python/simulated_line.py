@@ -6,6 +6,8 @@ computing. A run is the same on any computer, however busy, and says what the pr
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 import palpate.drivers._port
@@ -24,11 +26,13 @@ class SimulatedLine:
 
     def __init__(self, emulator: ServoBus, monkeypatch: pytest.MonkeyPatch) -> None:
         self.emulator = emulator
-        self.now_ns = 0
+        self.now_ns = emulator.world.last_ns = 0
         self._heard = b""
         self._free_ns = 0
         self._coming: list[tuple[int, bytes]] = []
         """when bytes arrive [ns], in order"""
+        self.delivery_ns = 0
+        """how long the adapter keeps what is written [ns]"""
         self.sent: list[tuple[int, bytes]] = []
         """when each packet was whole on the wire [ns], and the packet"""
         for module in (
@@ -102,8 +106,9 @@ class SimulatedLine:
             if packet is None:
                 return len(data)
             emulator.questions += 1
-            at = max(self.now_ns, self._free_ns) + self._wire_ns(packet)
+            at = max(self.now_ns + self.delivery_ns, self._free_ns) + self._wire_ns(packet)
             self.sent.append((at, packet))
+            self._at(at, emulator.world.advance)
             answers = emulator.answer(packet)
             emulator.last_packet = 1e-9 * at
             for answer in answers:
@@ -112,6 +117,12 @@ class SimulatedLine:
             if answers:
                 at += round(1e9 * emulator.usb)
                 self._coming.append((at, b"".join(emulator._spoil(a) for a in answers)))
+
+    def _at(self, when_ns: int, what: Callable[[], None]) -> None:
+        """Do it as if the clock stood there."""
+        now, self.now_ns = self.now_ns, when_ns
+        what()
+        self.now_ns = now
 
     def _wire_ns(self, packet: bytes) -> int:
         return round(1e9 * self.emulator._wire(len(packet)))

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from hypothesis import strategies as st
 
 from palpate import robots
 from palpate import weigh as W
+from palpate._core import Status
 from palpate.arm import Arm, Effort, Sensing
 from palpate.cli import main
 from palpate.drivers.bus import Bus, JointMap, Servo
@@ -30,6 +32,8 @@ from palpate.drivers.feetech import Feedback, FeetechDriver
 from palpate.drivers.laws import DriverLaws
 from palpate.drivers.servos import ServoDriver
 from palpate.errors import DriverError, InputError, MissingExtraError
+from palpate.simulate import Load, Plant
+from palpate.weigh import weighing
 from servo_bus import TURN, DynamixelBus, Emulated, FeetechBus, ServoBus
 from simulated_line import SimulatedLine
 from waiting import until
@@ -623,7 +627,7 @@ def test_damaged_answers_never_make_a_wrong_number(make: str) -> None:
                 break
             except DriverError:
                 assert attempt < 19
-        sent = np.zeros(7)
+        before = sent = np.zeros(7)
         seen = 0
         enabled = False
         for _ in range(20):
@@ -640,8 +644,13 @@ def test_damaged_answers_never_make_a_wrong_number(make: str) -> None:
                 seen += 1
                 np.testing.assert_allclose(sample.position, expected_positions(), atol=1e-9)
                 limit = 1e-9 if make == "dynamixel" else 0.006
-                np.testing.assert_allclose(sample.effort * 1.783, sent, atol=limit)
-            sent = arm_on_bus.write(0.1 * np.sin(k + np.arange(7)))
+                # of two commands in turn since the sample before
+                effort = sample.effort * 1.783
+                assert np.all(
+                    (effort > np.minimum(before, sent) - limit) & (effort < np.maximum(before, sent) + limit)
+                )
+                before = sent
+                sent = arm_on_bus.write(0.1 * np.sin(k + np.arange(7)))
         statistics = arm_on_bus.statistics
         arm_on_bus.close()
     assert emulator.damaged > 100 and statistics.corrupt > 50
@@ -864,36 +873,139 @@ def weigh(make: str, process: Process, folder: Path, *more: object) -> int:
 def test_weighs_over_the_bus(
     make: str, line: dict, tmp_path: Path, capsys: pytest.CaptureFixture[str], record_property
 ) -> None:
-    """In real time, which a busy machine cannot always keep: such a run is made again."""
-    for _ in range(4):
-        process = Process(make, tmp_path, bus={"baud": 1e6, "usb": 5e-4, "noise_counts": 2, **line})
-        code = weigh(make, process, tmp_path, "--duration", 5, "--json", "--no-report")
-        told = process.end()
-        captured = capsys.readouterr()
-        if code == 2:  # the emulated arm got no processor for so long that it seemed dead
-            assert re.search("no servo answers|no good answer|did not answer|watchdog", captured.err)
-            continue
-        assert code == 0, captured.err
-        found = json.loads(captured.out)
-        assert found["truth_kg"] is None and found["seed"] is None
-        assert told["on"] == []
-        if line:
-            assert found["bus"]["corrupt"] > 0 and told["damaged"] > 10
-        if found["bus"]["late"] > 0.02 * found["bus"]["periods"]:
-            continue  # not the loop that was asked for
-        good = found["status"] == "ok"
-        assert not good or abs(found["mass_kg"] - 0.25) < 5.0 * found["mass_std_kg"]
-        if good and found["mass_std_kg"] < 0.002:
-            assert abs(found["mass_kg"] - 0.25) < 0.02 * 0.25
-            if found["goal_error_rad"] < 0.05:
-                break
-        raise AssertionError(f"in time, and yet not weighed well: {found}")
-    else:
-        pytest.skip("this machine is too busy: in none of four runs it kept the time of the loop")
+    """In real time, however busy this computer is: what is marked ok is right. That it becomes ok: the next test."""
+    process = Process(make, tmp_path, bus={"baud": 1e6, "usb": 5e-4, "noise_counts": 2, **line})
+    code = weigh(make, process, tmp_path, "--duration", 5, "--json", "--no-report")
+    told = process.end()
+    captured = capsys.readouterr()
+    if code == 2:  # the emulated arm got no processor for so long that it seemed dead
+        assert re.search("no servo answers|no good answer|not answer|watchdog|no sample", captured.err)
+        return
+    assert code == 0, captured.err
+    found = json.loads(captured.out)
+    assert found["truth_kg"] is None and found["seed"] is None
+    assert told["on"] == []
+    if line:
+        assert found["bus"]["corrupt"] > 0 and told["damaged"] > 10
+    assert found["status"] != "ok" or abs(found["mass_kg"] - 0.25) < 5.0 * found["mass_std_kg"]
     for key in ("rate_hz", "lost", "late"):  # of this machine, as busy as it is: told, not judged
         record_property(f"{make}_{key}", found["bus"][key])
         print(make, line, key, found["bus"][key])
     assert main(["replay", str(tmp_path / "run.mcap"), "--quiet"]) == 0
+
+
+def stalled(
+    make: str,
+    where: str,
+    share: float,
+    longest: float,
+    monkeypatch: pytest.MonkeyPatch,
+    seed: int = 0,
+    **line,
+) -> tuple[W.Trial, ServoDriver]:
+    """A weighing in simulated time on a computer that is now and then taken away, or whose adapter is.
+
+    Args:
+        where: "wait": before the question; "answer": before it looks for the answers; "compute": before the command is
+            sent; "adapter": which takes packets late.
+        share: of the periods [1].
+        longest: [s].
+    """
+    rng = np.random.default_rng(seed)
+    plant = Plant(ARM)
+    plant.reset(None)
+    plant.attach(Load(0.25))
+    kind = DynamixelBus if make == "dynamixel" else FeetechBus
+    emulator = kind(emulated(make), plant=plant, noise_counts=2, seed=seed, **{**BUS, **line})
+    emulator.world.q = plant.q
+    simulated = SimulatedLine(emulator, monkeypatch)
+    arm_on_bus = driver(make, emulator.port, rate=250.0, patience=100)
+
+    def stall_ns() -> int:
+        return round(1e9 * longest * rng.random()) if rng.random() < share else 0
+
+    def after_a_stall(name: str, owner: object, *, adapter: bool = False) -> None:
+        method = getattr(owner, name)
+
+        def stalled_method(*given: object) -> object:
+            if adapter:
+                simulated.delivery_ns = stall_ns()
+            else:
+                simulated.now_ns += stall_ns()
+            return method(*given)
+
+        monkeypatch.setattr(owner, name, stalled_method)
+
+    if where == "adapter":
+        after_a_stall("write", simulated, adapter=True)
+    else:
+        after_a_stall({"wait": "_wait", "answer": "_collect", "compute": "_write"}[where], arm_on_bus)
+    with arm_on_bus:
+        place = W.scene(W.driven_arm(ARM, arm_on_bus))
+        task = W.Task(
+            scene=place,
+            start=W.present_pose(place.arm, arm_on_bus),
+            poses=(place.poses["Take3"],),
+            loads=None,
+            duration=5.0,
+            rate=250.0,
+        )
+        found = W.run(task, W.make_pipeline(place.arm)[0], driver=arm_on_bus)
+    return found, arm_on_bus
+
+
+@pytest.mark.parametrize("where", ["wait", "answer", "compute"])
+@pytest.mark.parametrize(("share", "longest"), [(0.05, 0.08), (1.0, 0.01), (1.0, 0.04)])
+@pytest.mark.parametrize("seed", [4])
+def test_a_busy_computer_does_not_bias_the_mass(
+    where: str, share: float, longest: float, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Late questions, late looks at the answers, late commands: each sample has its time and its period's effort."""
+    trial, arm_on_bus = stalled("dynamixel", where, share, longest, monkeypatch, seed)
+    assert arm_on_bus.statistics.late > 100
+    payload = trial.touch.payload
+    ok = payload.status == int(Status.ok)
+    error = np.abs(payload.mass - 0.25)
+    assert ok.mean() > 0.4
+    assert not np.any(ok & (error > 5.0 * payload.mass_std))
+    assert error[-1] < 0.02 * 0.25
+
+
+@pytest.mark.parametrize("make", MAKES)
+@pytest.mark.parametrize("corrupt", [0.0, 0.01])
+def test_weighs_well_on_a_calm_line(make: str, corrupt: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    trial, arm_on_bus = stalled(make, "wait", 0.0, 0.0, monkeypatch, corrupt=corrupt)
+    result = W.weigh_trial(trial)
+    assert result.status == Status.ok and not result.remarks
+    assert abs(result.mass - 0.25) < min(5.0 * result.mass_std, 0.02 * 0.25)
+    assert arm_on_bus.statistics.lost <= 0.01 * arm_on_bus.statistics.periods
+
+
+@pytest.mark.parametrize(("share", "longest"), [(0.1, 0.01), (1.0, 0.003), (1.0, 0.006)])
+def test_an_adapter_that_is_late_makes_no_wrong_mass(
+    share: float, longest: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody can tell when a command got there; the estimators' own doubts must do."""
+    trial, _ = stalled("dynamixel", "adapter", share, longest, monkeypatch)
+    payload = trial.touch.payload
+    ok = payload.status == int(Status.ok)
+    assert not np.any(ok & (np.abs(payload.mass - 0.25) > 5.0 * payload.mass_std))
+
+
+def test_a_loop_that_was_late_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Skipped periods are counted from the samples' own times; what they may be depends on what an effort is."""
+    trial, _ = stalled("dynamixel", "wait", 0.05, 0.03, monkeypatch)
+    late, expected = weighing.late_periods(trial.log, trial.touch, 250.0)
+    times = np.diff(trial.log.time_ns) * 250e-9
+    assert expected == pytest.approx(float(times.sum()), abs=0.5)
+    assert late >= np.sum(np.maximum(np.rint(times) - 1.0, 0.0)) > 0.03 * expected
+    assert W.weigh_trial(trial).status == Status.ok
+    refused = W.weigh_trial(replace(trial, effort_of_period=False))
+    assert refused.status == Status.gap and refused.estimator_status == Status.ok
+    assert f"{late} were skipped or irregular" in refused.remarks[0] and "at most 2%" in refused.remarks[0]
+    crawling, _ = stalled("dynamixel", "wait", 1.0, 0.04, monkeypatch)
+    refused = W.weigh_trial(crawling)
+    assert refused.status == Status.gap and "at most 50%" in refused.remarks[0]
 
 
 def test_a_servo_that_dies_while_weighing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

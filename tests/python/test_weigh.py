@@ -13,6 +13,7 @@ import palpate as pp
 from palpate import weigh as W
 from palpate.arm import Sensing
 from palpate.logs import Signal
+from palpate.weigh import weighing
 
 MASS = 0.25
 
@@ -532,6 +533,11 @@ def test_where_stiction_hides_the_weight_a_two_way_motion_is_proposed():
         assert motion.hidden < 2.0 * 1.96 * found.mass_std * 7**0.5
         assert any(motion.joint in r and "and back, twice" in r for r in found.remarks)
         assert found.summary()["proposal"] == motion.summary()
+    # however wide: nothing but motion tells a load from what stiction holds
+    for wider in (1.0, 10.0, 1000.0):
+        payload = replace(found.touch.payload, mass_std=wider * found.touch.payload.mass_std)
+        doubtful = replace(found, touch=replace(found.touch, payload=payload))
+        assert weighing._two_way(doubtful) == motion
     smooth = tuple(j.replace(friction=pp.Friction(viscous=1.0)) for j in arm.joints)
     assert W.weigh_log(resting(arm, 4.0, 500.0, 1.0), arm.replace(joints=smooth)).proposal is None
 

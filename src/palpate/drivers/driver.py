@@ -45,6 +45,10 @@ class Driver(ABC):
         DriverError: no joints, or a period that is not positive.
     """
 
+    effort_of_period = False
+    """Whether a sample's effort is the mean since the sample before even where the loop was late; else it is only so
+    while the loop keeps its period."""
+
     def __init__(self, joint_names: tuple[str, ...], period_ns: int, effort: Effort) -> None:
         if not joint_names:
             raise DriverError("a driver needs at least one joint")

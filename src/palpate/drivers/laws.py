@@ -153,20 +153,20 @@ class DriverLaws:
             assert np.array_equal(first.effort, effort, equal_nan=True)
 
     def test_write_says_what_was_sent(self) -> None:
-        """write() returns what the drives apply: the next sample's effort is just that."""
+        """write() returns what the drives apply: once held for a whole period, the sample's effort is just that."""
         with self.make() as driver:
             driver.enable()
             gain = driver.effort.gain(driver.n)
-            sent = None
+            sent, held = np.zeros(driver.n), False
             for k in range(self.periods):
                 sample = None if driver.finished else driver.read()
-                if sample is not None and sent is not None:
+                if sample is not None and held:
                     np.testing.assert_allclose(
                         sample.effort * gain, sent, rtol=0.0, atol=self.effort_tolerance
                     )
-                command = self._command(driver, k)
+                command = self._command(driver, k // 2)
                 given = command.copy()
-                sent = driver.write(command)
+                sent, held = driver.write(command), k % 2 == 1 and sample is not None
                 assert sent.shape == (driver.n,) and sent.dtype == np.float64
                 assert np.isfinite(sent).all()
                 assert np.array_equal(command, given), "write() must not change its argument"

@@ -85,8 +85,10 @@ class ServoDriver(Driver):
     one without a good answer for `patience` periods in a row. Either is a DriverError with its id, and the drives are
     stopped.
 
-    The time of a sample is the middle between question and last answer. Velocity is in the samples if the arm's card
-    states its deviation for every joint; servos filter it.
+    The time of a sample is that of the question and half of what the answers usually take, however late a busy computer
+    looks at them. The effort of a sample is the mean of its period: what flowed at the sample before until the command
+    was sent, what flows now from then on, however late it was sent. Velocity is in the samples if the arm's card states
+    its deviation for every joint; servos filter it.
 
     Args:
         arm: the arm.
@@ -99,6 +101,8 @@ class ServoDriver(Driver):
         InputError: bus and arm do not fit, or a number is out of range.
         MissingExtraError: the SDK is not installed.
     """
+
+    effort_of_period = True
 
     _block: tuple[int, int]
     """address and length [bytes] of what is read in every period"""
@@ -148,7 +152,9 @@ class ServoDriver(Driver):
         self._statistics = BusStatistics()
         self._silent = dict.fromkeys(self._ids, 0)
         self._timed_out = self._unsettled = False
-        self._delay_ms = math.inf
+        self._delay_ms = self._usual_ns = math.inf
+        self._sample: tuple[int, Array] | None = None
+        self._sent_ns = 0
         self._complaints.clear()
         self._doubts.clear()
 
@@ -207,6 +213,7 @@ class ServoDriver(Driver):
     def _enable(self) -> None:
         for i in range(len(self._servos)):
             self._switch_on(i)
+        self._due = time.monotonic_ns() - self._period_ns  # the loop was not late: it has not begun
 
     def _disable(self) -> None:
         """Goal zero and torque off: to all at once, then to each until it confirms; a dead one holds up nobody."""
@@ -239,12 +246,15 @@ class ServoDriver(Driver):
         with self._talking():
             self._everybody.txPacket()
             found = self._collect(self._ids)
-            middle = (begin + self._heard_ns) // 2
+            took = self._heard_ns - begin
             self._unsettled = self._timed_out
             if not self._timed_out:
-                self._learn_delay(1e-6 * (self._heard_ns - begin))
+                self._learn_delay(1e-6 * took)
             self._hear_complaints(found)
             again = [i for i in self._ids if i not in found]
+            if not again:
+                self._usual_ns = min(took, self._usual_ns * (1.0 + 1.0 / _CALM))
+            middle = begin + round(0.5 * min(took, self._usual_ns))
             if again:
                 found |= self._ask_again(again, sorted(found), middle)
                 behind = self._heard_ns - middle
@@ -259,9 +269,16 @@ class ServoDriver(Driver):
             return None
         position, speed, current = np.array([found[i] for i in self._ids]).T
         velocity = self._map.velocity(speed) if self._measures_velocity else None
-        return Sample(
-            middle - self._start, self._map.position(position), velocity, self._map.effort_of(current)
-        )
+        effort = self._map.effort_of(self._mean_current(middle, current))
+        return Sample(middle - self._start, self._map.position(position), velocity, effort)
+
+    def _mean_current(self, now: int, current: Array) -> Array:
+        """(S,) of the period that ends now [ns], in which a command took the place of the one before."""
+        last, self._sample = self._sample, (now, current)
+        if last is None or not last[0] < self._sent_ns < now:
+            return current
+        before = (self._sent_ns - last[0]) / (now - last[0])
+        return before * last[1] + (1.0 - before) * current
 
     # --- the bus --------------------------------------------------------------------------------------------
 
@@ -453,6 +470,7 @@ class ServoDriver(Driver):
             group.addParam(servo, list(value))
         with self._talking():
             result = group.txPacket()
+        self._sent_ns = time.monotonic_ns()
         if result != self._sdk.COMM_SUCCESS:
             raise DriverError(f"{self._path}: cannot be written: {self._packets.getTxRxResult(result)}")
 

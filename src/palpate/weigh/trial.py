@@ -7,7 +7,7 @@ import json
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -151,6 +151,8 @@ class Trial:
     """(N, n) torque that was really sent [N m]"""
     control: npt.NDArray[np.uint8]
     """(N,) Status of the command: ok or saturated"""
+    effort_of_period: bool = False
+    """see :attr:`palpate.drivers.Driver.effort_of_period`"""
     interrupted: bool = False
     """stopped before its end"""
     picture: npt.NDArray[np.uint8] | None = None
@@ -261,8 +263,8 @@ def arrival(task: Task) -> float:
     return Route(task).end
 
 
-def describe(task: Task, pipeline: Pipeline) -> dict[str, str]:
-    """What a recording must say to be replayed: card, pipeline, task, seed, version."""
+def describe(task: Task, pipeline: Pipeline, *, effort_of_period: bool = False) -> dict[str, str]:
+    """What a recording must say to be replayed and judged: card, pipeline, task, seed, version."""
     arm = task.scene.arm
     plan: dict[str, Any] = {
         "arm": arm.name,
@@ -273,6 +275,7 @@ def describe(task: Task, pipeline: Pipeline) -> dict[str, str]:
         "move_s": task.move,
         "hold_s": task.hold,
         "rate_hz": task.rate,
+        "effort_of_period": effort_of_period,
         "noise": task.noise,
         "jitter_s": task.jitter,
         "loss": task.loss,
@@ -402,7 +405,11 @@ def run(
     recorder = None
     if record is not None:
         recorder = Recorder(
-            record, arm.joint_names, session=describe(task, pipeline), frame_id=arm.base, overwrite=True
+            record,
+            arm.joint_names,
+            session=describe(task, pipeline, effort_of_period=driver.effort_of_period),
+            frame_id=arm.base,
+            overwrite=True,
         )
     try:
         with driver:
@@ -452,7 +459,9 @@ def run(
     finally:
         if recorder is not None:
             recorder.close()
-    return rows.result(task, pipeline, interrupted, drawn, error)
+    return replace(
+        rows.result(task, pipeline, interrupted, drawn, error), effort_of_period=driver.effort_of_period
+    )
 
 
 def _over(task: Task, time: float, touch: Touch) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -31,6 +32,11 @@ _HOPELESS = 2.0
 """an arm whose pose takes so many times its torque limit does not lift but is dragged along"""
 _SLOW = 200.0
 """below it the payload filter's steps from sample to sample are too long for friction and drives [Hz]"""
+_TELLING = 1e-3
+"""what hides less than this does not matter [kg]"""
+_LATE, _LATE_OF_PERIOD = 0.02, 0.5
+"""most of the periods of a real arm's loop that may be skipped or irregular [1]; the second where each sample's effort
+is the mean since the one before, so that late periods bias nothing as long as the arm is controlled at all"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -383,6 +389,11 @@ def weigh_trial(trial: Trial, *, pose: str = "", scene: Scene | None = None) -> 
             remarks.insert(0, held_back[1])
             if held_back[0] and status == Status.ok:
                 status = Status.saturated
+    if not task.simulated:
+        late = _late(log, trial.touch, task.rate, trial.effort_of_period)
+        if late and status == Status.ok:
+            status = Status.gap
+        remarks[:0] = late
     if trial.interrupted:
         remarks.insert(0, f"Stopped after {log.duration:.2f} of {task.duration:g} s.")
     result = Weighing(
@@ -427,6 +438,49 @@ def _arrived(trial: Trial) -> tuple[float, tuple[bool, str] | None]:
         False,
         f"The arm stops {error:.2f} rad short of the pose: {why}. The weighing does not depend on it.",
     )
+
+
+def late_periods(log: Log, touch: Touch, rate: float) -> tuple[int, int]:
+    """Skipped or irregular periods of a control loop since the load last changed, and how many there should have been.
+
+    Args:
+        log: of the loop.
+        touch: one row per sample.
+        rate: that was asked for [Hz].
+
+    Returns:
+        periods of which the loop skipped some, or that differ by more than a half, as many as they would have been; and
+        the time, in periods.
+    """
+    since = int(touch.payload.change_time_ns[-1]) if len(log) else 0
+    time = log.time_ns[log.time_ns >= since]
+    periods = np.diff(time) * 1e-9 * rate
+    wrong = periods[np.abs(periods - 1.0) > 0.5]
+    return int(np.sum(np.maximum(np.rint(wrong) - 1.0, 1.0))), round(float(np.sum(periods)))
+
+
+def _late(log: Log, touch: Touch, rate: float, effort_of_period: bool) -> list[str]:
+    """Why a real arm's loop cannot be weighed by; empty: it can."""
+    late, expected = late_periods(log, touch, rate)
+    limit = _LATE_OF_PERIOD if effort_of_period else _LATE
+    if late <= limit * expected:
+        return []
+    return [
+        f"Of {expected} periods at {rate:g} Hz {late} were skipped or irregular, {late / expected:.0%}; at most "
+        f"{limit:.0%} may be, for what moved the arm in them is not known well enough. The number is not to be used: "
+        "end what else this computer does, or ask for a lower rate (--rate)."
+    ]
+
+
+def _recorded_late(log: Log, touch: Touch) -> list[str]:
+    """The same of a recording; empty also where it is none of a real arm's loop."""
+    try:
+        plan = json.loads(log.meta.get("task", "null"))
+        if not isinstance(plan, dict) or plan["loads_s_kg"] is not None:
+            return []
+        return _late(log, touch, float(plan["rate_hz"]), bool(plan.get("effort_of_period", False)))
+    except (ValueError, KeyError, TypeError):  # of another program: it says nothing about a loop
+        return []
 
 
 def _truth(log: Log, loads: tuple[tuple[float, float], ...] | None = None) -> tuple[Array, Array]:
@@ -530,12 +584,17 @@ def weigh_log(
     )
     remarks += decided
     touch = pipeline.run(log)
+    status = Status(int(touch.payload.status[-1])) if len(log) else Status.warming
+    late = _recorded_late(log, touch)
+    if late and status == Status.ok:
+        status = Status.gap
+    remarks[:0] = late
     result = Weighing(
         arm=arm,
         pipeline=pipeline.options(),
         log=log,
         touch=touch,
-        status=Status(int(touch.payload.status[-1])) if len(log) else Status.warming,
+        status=status,
         truth=_truth(log),
         desired=_setpoints(log),
     )
@@ -582,13 +641,19 @@ def fit_log(log: Log, arm: Arm) -> tuple[Arm, Log, list[str]]:
 
 
 def _two_way(result: Weighing) -> TwoWayMotion | None:
-    """The motion to propose where the mass is hardly better known than stiction at rest allows."""
+    """The motion to propose where the mass is hardly better known than stiction at rest allows.
+
+    However much worse it is known: at rest all that the joints feel below stiction may be a load, a push or nothing,
+    so that doubts which widen the interval by any factor end only in motion, too. Where stiction hides nothing that
+    matters there is nothing to propose.
+    """
     finite = np.isfinite(result.log.position).all(axis=1) & (np.abs(result.log.position) < 1e3).all(axis=1)
     if not finite.any():
         return None
     q = result.log.position[finite][-1]
     stiction = stiction_std(result.arm, q)
-    if not 0.5 * stiction < result.mass_std < 20.0 * stiction:  # far more than stiction has another reason
+    matters = max(TWO_PERCENT * abs(result.mass), _TELLING)
+    if not (stiction < math.inf and matters < stiction < 2.0 * result.mass_std):
         return None
     return two_way_motion(result.arm, q)
 
