@@ -118,10 +118,10 @@ MODELS = MappingProxyType(
 class DynamixelDriver(ServoDriver):
     """Reads and commands Dynamixel servos; the SDK is the extra ``dynamixel``.
 
-    Effort is the present current [A], mean of a period, with the joint's sign. connect() switches the torque of every servo off: hold the
-    arm. enable() puts them into current control, a setting that stays in the servo, and sets their watchdog: so long
-    after the last packet they stop by themselves, whatever has become of this program. A hardware error of any servo
-    stops all.
+    Effort is the present current [A], mean of a period, with the joint's sign. connect() switches the torque of
+    every servo off: hold the arm. enable() puts them into current control, a setting that stays in the servo, and
+    sets their watchdog: so long after the last packet they stop by themselves, whatever has become of this program.
+    A hardware error of any servo stops all.
 
     Args:
         arm, port, bus, rate, patience: see :class:`~palpate.drivers.servos.ServoDriver`.

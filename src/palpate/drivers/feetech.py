@@ -119,11 +119,11 @@ def signed(word: int, bit: int) -> int:
 class FeetechDriver(ServoDriver):
     """Reads and commands STS3215 servos; the SDK is the extra ``feetech``.
 
-    Effort is the present current [A], mean of a period, with the joint's sign. connect() switches the torque of every servo off: hold the
-    arm. enable() puts them into PWM mode until they lose power. They have no watchdog: a program that is killed
-    leaves them pushing with the last command. The bus file must name each servo's model. An error in a servo's
-    status stops all. An answer is protected by one byte only, so that one in 256 damaged answers looks good: positions
-    that jump are asked for again.
+    Effort is the present current [A], mean of a period, with the joint's sign. connect() switches the torque of
+    every servo off: hold the arm. enable() puts them into PWM mode until they lose power. They have no watchdog: a
+    program that is killed leaves them pushing with the last command. The bus file must name each servo's model. An
+    error in a servo's status stops all. An answer is protected by one byte only, so that one in 256 damaged answers
+    looks good: positions that jump are asked for again.
 
     Args:
         arm, port, bus, rate, patience: see :class:`~palpate.drivers.servos.ServoDriver`.
