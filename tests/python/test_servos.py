@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import json
 import math
 import re
@@ -979,6 +980,39 @@ def test_weighs_well_on_a_calm_line(make: str, corrupt: float, monkeypatch: pyte
     assert result.status == Status.ok and not result.remarks
     assert abs(result.mass - 0.25) < min(5.0 * result.mass_std, 0.02 * 0.25)
     assert arm_on_bus.statistics.lost <= 0.01 * arm_on_bus.statistics.periods
+
+
+def test_no_collection_of_garbage_while_the_arm_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A minute's samples take the collector 0.1 s, ten minutes' samples longer than the watchdog waits."""
+    seen = []
+    write = DynamixelDriver._write
+
+    def looking(self: DynamixelDriver, torque: np.ndarray) -> np.ndarray:
+        seen.append(gc.isenabled())
+        return write(self, torque)
+
+    monkeypatch.setattr(DynamixelDriver, "_write", looking)
+    assert gc.isenabled()
+    stalled("dynamixel", "wait", 0.0, 0.0, monkeypatch)
+    assert len(seen) > 1000 and not any(seen)
+    assert gc.isenabled()
+
+
+def test_seven_servos_keep_250_hz(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In simulated time: bytes, adapter, looks at line and clock, and 1.2 ms of computing fit into a period."""
+    emulator = bus("dynamixel", **BUS)
+    line = SimulatedLine(emulator, monkeypatch)
+    with driver("dynamixel", emulator.port, rate=250.0) as arm_on_bus:
+        arm_on_bus.enable()
+        times = []
+        for _ in range(600):
+            sample = arm_on_bus.read()
+            assert sample is not None
+            times.append(sample.time_ns)
+            line.now_ns += 1_200_000
+            arm_on_bus.write(np.full(7, 0.1))
+        assert arm_on_bus.statistics.late == arm_on_bus.statistics.lost == 0
+    assert 599e9 / (times[-1] - times[0]) == pytest.approx(250.0, rel=1e-3)
 
 
 @pytest.mark.parametrize(("share", "longest"), [(0.1, 0.01), (1.0, 0.003), (1.0, 0.006)])

@@ -16,6 +16,8 @@ GRACE_MS = 10.0
 GAP_MS = 1.7
 """the same from one answer to the next [ms]"""
 _WRITE_S = 0.2
+_AT_ONCE = 4096
+"""most bytes taken from the line at once"""
 _logger = logging.getLogger(__name__)
 
 
@@ -38,11 +40,16 @@ def open_port(handler: type, path: str, baud: int) -> Any:
         unread = 0
         """bytes that came too late and were thrown away"""
 
+        held = b""
+        """bytes that came with those asked for: the answers of many servos arrive together"""
+
         def readPort(self, length: int) -> bytes:
-            rest = (self.packet_timeout - self.getTimeSinceStart()) * 1e-3
-            if rest > 0.0:
-                select.select([self.ser.fileno()], [], [], rest)
-            data: bytes = self.ser.read(length)
+            if not self.held:
+                rest = (self.packet_timeout - self.getTimeSinceStart()) * 1e-3
+                if rest > 0.0:
+                    select.select([self.ser.fileno()], [], [], rest)
+                self.held = self.ser.read(_AT_ONCE)
+            data, self.held = self.held[:length], self.held[length:]
             return data
 
         def setPacketTimeout(self, packet_length: int) -> None:
@@ -59,7 +66,8 @@ def open_port(handler: type, path: str, baud: int) -> Any:
 
         def clearPort(self) -> None:
             # a late answer to an earlier question must not be taken for the answer to this one
-            self.unread += self.ser.in_waiting
+            self.unread += len(self.held) + self.ser.in_waiting
+            self.held = b""
             self.ser.reset_input_buffer()
 
     latency = _usb_latency_ms(path)

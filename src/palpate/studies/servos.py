@@ -22,7 +22,11 @@ _CYCLES = 2
 def _run(task: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
     found = _timed.measured("_servos_run", task, task["seconds"], progress)
     if found["words"] and not task["dead"]:
-        raise PalpateError(f"the emulated bus ended: {found['words']}; is this computer too busy for it?")
+        raise PalpateError(
+            f"the arm was stopped before {task['seconds']:g} s were over, as it should be: {found['words']} (after "
+            f"{found['periods']} periods, {found['late']} more skipped). This computer is too busy to serve the servos in "
+            "time: measure on a quiet one"
+        )
     return found
 
 
