@@ -24,8 +24,8 @@ def _run(task: Mapping[str, Any], progress: Progress) -> dict[str, Any]:
     if found["words"] and not task["dead"]:
         raise PalpateError(
             f"the arm was stopped before {task['seconds']:g} s were over, as it should be: {found['words']} (after "
-            f"{found['periods']} periods, {found['late']} more skipped). This computer is too busy to serve the servos in "
-            "time: measure on a quiet one"
+            f"{found['periods']} periods, {found['late']} more skipped). This computer is too busy to serve the servos "
+            "in time: measure on a quiet one"
         )
     return found
 
