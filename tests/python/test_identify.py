@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
-from palpate import Arm, Effort, Friction, Joint, robots
+from palpate import Arm, Effort, Friction, Joint, Status, robots
+from palpate import weigh as W
+from palpate.arm import Sensing
 from palpate.errors import InputError, LogError
 from palpate.identify import (
     Coupling,
@@ -36,6 +39,7 @@ from palpate.identify.regress import (
     structural_rank,
 )
 from palpate.logs import Log, Signal
+from palpate.logs.noise import beside_rounding
 
 pytest.importorskip("scipy", reason="palpate[identify] is not installed")
 
@@ -634,3 +638,70 @@ def test_a_servo_that_is_held_by_its_friction_is_not_weighed():
         drive.weigh(arm, counted[count + 100 :])
     with pytest.raises(InputError, match="one joint"):
         drive.weigh(truth(), log)
+
+
+# -- the encoders' noise ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-4, 2e-3])
+@pytest.mark.parametrize("noise", [5e-5, 1e-3])
+def test_the_encoders_noise_is_found(step: float, noise: float) -> None:
+    """In motion, rounded or not: within a tenth in every joint, or not seen below the rounding."""
+    arm = truth()
+    rng = np.random.default_rng(7)
+    found = []
+    for seed in range(4):
+        log = simulate(arm, 10.0, seed=seed)
+        position = log.position + noise * rng.standard_normal(log.position.shape)
+        if step:
+            position = step * np.rint(position / step)
+        log = dataclasses.replace(log, position=position, velocity=None)
+        data = prepare(log)
+        assert data.velocity_noise is None
+        found.append(
+            [beside_rounding(s, r) for s, r in zip(data.position_noise, data.resolution, strict=True)]
+        )
+    if noise > step:
+        np.testing.assert_allclose(found, noise, rtol=0.1)
+    elif step:
+        # rounding hides smaller noise: what is told stays below it
+        assert np.max(found) < noise + step / math.sqrt(12.0)
+
+
+def test_an_so101_weighs_with_its_identified_card() -> None:
+    """Its filter would believe each reading of the encoders, were their noise not in the card."""
+    place = W.scene(W.load_arm("so101"))
+    arm = place.arm
+
+    def trial(poses: list[np.ndarray], mass: float, duration: float, **timing: float) -> Log:
+        task = W.Task(
+            scene=place,
+            start=poses[0],
+            poses=tuple(poses[1:]),
+            loads=((0.0, mass),),
+            duration=duration,
+            seed=3,
+            **timing,
+        )
+        return W.run(task, W.make_pipeline(arm)[0]).log
+
+    rng = np.random.default_rng(0)
+    lower = np.array([max(j.limits.lower, -1.5) for j in arm.joints])
+    upper = np.array([min(j.limits.upper, 1.5) for j in arm.joints])
+    start = place.poses[place.start]
+    free = trial(
+        [start, *(lower + (upper - lower) * rng.random(arm.n) for _ in range(16))],
+        0.0,
+        25.0,
+        move=1.2,
+        hold=0.3,
+    )
+    undescribed = arm.replace(joints=tuple(j.replace(sensing=Sensing()) for j in arm.joints))
+    card = fit(undescribed, free).arm
+    for joint, true in zip(card.joints, arm.joints, strict=True):
+        assert joint.sensing.position_std == pytest.approx(true.sensing.position_std, rel=0.1)
+        assert joint.sensing.position_resolution == pytest.approx(true.sensing.position_resolution, rel=1e-3)
+    log = trial([start, place.poses[place.pose]], 0.25, 6.0, move=3.0)
+    found = W.weigh_log(log, card)
+    assert found.status == Status.ok
+    assert abs(found.mass - 0.25) < min(5.0 * found.mass_std, 0.05 * 0.25)

@@ -71,7 +71,9 @@ def test_every_reference_arm_weighs(name: str) -> None:
     assert result.status == pp.Status.ok
     assert abs(result.error_percent) < 2.0
     assert result.time_to_2_percent < 3.0
-    assert result.goal_error < (0.1 if name == "abb_irb2400_16" else 0.02)  # dry friction holds that one short of it
+    assert result.goal_error < (
+        0.1 if name == "abb_irb2400_16" else 0.02
+    )  # dry friction holds that one short of it
 
 
 def test_the_goal_is_reached_with_what_was_weighed() -> None:

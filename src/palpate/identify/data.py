@@ -11,6 +11,7 @@ import numpy as np
 from palpate.arm import Array
 from palpate.errors import InputError, LogError, MissingExtraError
 from palpate.logs import Log
+from palpate.logs.noise import white_noise
 
 LEAST_CUTOFF = 5.0
 """the parallel filter never goes below [Hz]: reversals of friction hold more than the motion's own band"""
@@ -83,6 +84,8 @@ class RegressionData:
         weight: (M,) weight of each row's squared residual [1], from the logs' weights.
         noise: (n,) standard deviation of what the filters took out of the effort, driver's unit.
         resolution: (n,) smallest step of the position readings [rad]; 0 where they look continuous.
+        position_noise: (n,) standard deviation of the white part of the position readings, rounding included [rad].
+        velocity_noise: (n,) the same of the measured velocities [rad/s]; None where they were not taken.
         cutoff: of the parallel filter [Hz].
         rate: rows per second [Hz].
         effort_unit: as the first log declares it; empty if it does not.
@@ -100,6 +103,8 @@ class RegressionData:
     weight: Array
     noise: Array
     resolution: Array
+    position_noise: Array
+    velocity_noise: Array | None
     cutoff: float
     rate: float
     effort_unit: str = ""
@@ -219,6 +224,12 @@ def prepare(
     def rows(name: str) -> Array:
         return np.concatenate([getattr(s, name)[p] for s, p in zip(segments, parts, strict=True)])
 
+    used = [log for log, o in zip(logs, origins, strict=True) if o.used]
+    velocities = [
+        log.velocity if o.velocity == "measured" else None
+        for log, o in zip(logs, origins, strict=True)
+        if o.used
+    ]
     counts = [len(s.time[p]) for s, p in zip(segments, parts, strict=True)]
     number = np.repeat([s.log for s in segments], counts)
     return RegressionData(
@@ -236,10 +247,24 @@ def prepare(
         resolution=np.array(
             [_resolution(np.concatenate([log.position[:, j] for log in logs])) for j in range(len(names))]
         ),
+        position_noise=_white([log.position for log in used], [log.seconds for log in used]),
+        velocity_noise=_white([v for v in velocities if v is not None], [log.seconds for log in used])
+        if all(v is not None for v in velocities)
+        else None,
         cutoff=cutoff,
         rate=segments[0].rate / (parts[0].step or 1),
         effort_unit=logs[0].meta.get("effort_unit", ""),
     )
+
+
+def _white(readings: Sequence[Array], seconds: Sequence[Array]) -> Array:
+    """(n,) RMS over the logs of the white part of their readings (N, n) at their times (N,) [s]."""
+    found = [
+        [white_noise(column[good], time[good]) for column in values.T]
+        for values, time in zip(readings, seconds, strict=True)
+        if np.count_nonzero(good := np.isfinite(values).all(axis=1)) >= 100
+    ]
+    return np.sqrt(np.mean(np.square(found), axis=0)) if found else np.zeros(readings[0].shape[1])
 
 
 def _resolution(position: Array) -> float:

@@ -40,6 +40,7 @@ from palpate.identify.regress import (
     structural_rank,
 )
 from palpate.logs import Log
+from palpate.logs.noise import LEAST_VELOCITY, beside_rounding
 from palpate.logs.repair import BoolArray
 
 Method = Literal["consistent", "damped", "irls", "wls", "ols"]
@@ -674,6 +675,10 @@ def identified(arm: Arm, problem: Problem, phi: Array, data: RegressionData, gai
                 sensing=replace(
                     joint.sensing,
                     position_resolution=float(data.resolution[i]),
+                    position_std=beside_rounding(float(data.position_noise[i]), float(data.resolution[i])),
+                    velocity_std=joint.sensing.velocity_std
+                    if data.velocity_noise is None
+                    else max(float(data.velocity_noise[i]), LEAST_VELOCITY),
                     torque_std=float(abs(gain[i]) * data.noise[i]),
                 ),
             )
