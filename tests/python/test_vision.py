@@ -141,6 +141,89 @@ def test_two_boards_are_both_told():
     assert any("2 boards" in r for r in sight.remarks())
 
 
+def beside(gap, frame=20):
+    """Two boards on one wall, their frames `gap` pixels of the texture apart, seen askew; the corners of both."""
+    one = texture(frame=frame)
+    h, w = one.shape[:2]
+    face = np.full((h, 2 * w + gap, 3), 95, np.uint8)
+    face[:, :w], face[:, w + gap :] = one, texture(strokes=False, frame=frame)
+    x = np.array([frame, w - frame, w + gap + frame, 2 * w + gap - frame]) - 0.5
+    y = np.array([frame, h - frame]) - 0.5
+    H = cv2.getPerspectiveTransform(
+        np.float32([[0, 0], [2 * w + gap, 0], [2 * w + gap, h], [0, h]]),
+        np.float32([[150, 180], [1130, 120], [1090, 560], [180, 480]]),
+    )
+    seen = cv2.warpPerspective(face, H, (1280, 720), flags=cv2.INTER_AREA, borderValue=(95, 95, 95))
+    corners = [
+        cv2.perspectiveTransform(
+            np.float32([[[x[k], y[0]], [x[k + 1], y[0]], [x[k + 1], y[1]], [x[k], y[1]]]]), H
+        )[0]
+        for k in (0, 2)
+    ]
+    noise = np.random.default_rng(0).normal(0.0, 2.0, seen.shape)
+    return np.clip(np.rint(cv2.GaussianBlur(seen, (0, 0), 0.8) + noise), 0, 255).astype(np.uint8), corners
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("gap", [0, 12])
+def test_two_boards_side_by_side_are_not_one(gap, turned):
+    image, corners = beside(gap)
+    if turned:
+        image, corners = np.rot90(image), [np.stack([c[:, 1], 1279 - c[:, 0]], 1) for c in corners]
+    found = vision.detect(image)
+    assert len(found) == 2
+    assert all(min(error(b, true) for b in found) < 3.0 for true in corners)
+    assert any("2 boards" in r for r in vision.see(image).remarks())
+
+
+def test_a_line_across_is_a_line_or_a_seam_and_it_is_said():
+    plain = texture(strokes=False)
+    for reach, least, most in ((40, 0.0, 0.3), (0, 0.1, 1.0)):
+        flat = plain.copy()
+        cv2.line(flat, (480, 30 + reach), (480, 629 - reach), (40, 40, 40), 6)
+        H = cv2.getPerspectiveTransform(
+            np.float32([[30, 30], [930, 30], [930, 630], [30, 630]]) - np.float32(0.5), np.float32(VIEW)
+        )
+        seen = cv2.warpPerspective(flat, H, (1280, 720), flags=cv2.INTER_AREA, borderValue=(95, 95, 95))
+        (board, *more) = vision.detect(cv2.GaussianBlur(seen, (0, 0), 0.8))
+        two = 1.0 if more else board.divided
+        assert least <= two <= most
+        assert more or board.confidence <= 1.0 - two
+
+
+def test_a_lamp_and_a_painted_panel_are_hardly_boards(plain):
+    for surface in ((255, 255, 255), (60, 170, 60), (70, 70, 70)):
+        image = np.full((720, 1280, 3), 130, np.uint8)
+        cv2.rectangle(image, (0, 0), (1279, 60), (235, 235, 235), -1)  # something white in the room
+        cv2.fillConvexPoly(image, np.int32(VIEW), surface, cv2.LINE_AA)
+        image = cv2.GaussianBlur(image, (0, 0), 0.8)
+        found = vision.detect(image)
+        assert all(b.confidence < 0.9 for b in found)
+    assert vision.detect(plain)[0].confidence > 0.98
+
+
+@pytest.mark.parametrize("side", range(4))
+def test_a_side_in_burnt_light_says_that_it_is_not_seen(plain, side):
+    a, b = VIEW[side], VIEW[(side + 1) % 4]
+    inward = 0.12 * (VIEW.mean(0) - 0.5 * (a + b))
+    along = 0.1 * (b - a)
+    light = np.zeros(plain.shape[:2], np.float32)
+    band = [a - along - 2.0 * inward, b + along - 2.0 * inward, b + along + inward, a - along + inward]
+    cv2.fillPoly(light, [np.int32(np.rint(band))], 300.0)
+    seen = np.clip(plain + cv2.GaussianBlur(light, (0, 0), 4.0)[..., None], 0, 255).astype(np.uint8)
+    sure = vision.detect(plain)[0].confidence
+    for board in vision.detect(seen):
+        off = board_detection.corner_errors(board.corners, VIEW)
+        assert board.confidence < sure
+        assert (off <= np.maximum(2.0 * board.sigma, 3.0)).all()
+
+
+def test_a_white_surface_without_a_shade_is_still_seen():
+    """Over-exposed all over, not in one place: its border is as sharp as ever."""
+    (board,) = vision.detect(np.clip(picture(frame=40).astype(float) * 1.25, 0, 255).astype(np.uint8))
+    assert error(board) < 1.5 and (board.sigma < 5.0).all()
+
+
 def test_a_board_that_reaches_out_of_view_is_not_called_whole():
     outside = VIEW + np.array([420.0, 0.0])
     boards = vision.detect(picture(outside))
@@ -652,7 +735,7 @@ def test_photographs(name):
 
 
 def test_the_study_runs(monkeypatch):
-    monkeypatch.setattr(board_detection, "QUICK", (1, 1, 1))
+    monkeypatch.setattr(board_detection, "QUICK", (1, 1, 1, 1))
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # in this process
     monkeypatch.setattr(board_detection, "_photographs", list)
     from palpate.studies import STUDIES

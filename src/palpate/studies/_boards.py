@@ -20,6 +20,8 @@ Float = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
 WIDTH, HEIGHT = 1280, 720
+MARGIN = 40
+"""around a board's texture [pixels]"""
 _WORDS = (
     "force torque mass board erase plan clean arm tau = J F m g sin(q) + b t 0.25 kg 9.81 Monday note call lab"
     " budget 42 % todo x^2 -> robot meeting 14:30 room B.12 error? yes no item (a) (b) f(x) = ax + b"
@@ -42,6 +44,8 @@ class Scene:
     """(H, W, 3) BGR"""
     corners: Array | None
     """(4, 2) of the writing surface [pixels], clockwise from the top-left one of the board; None: no board"""
+    beside: Array | None
+    """(4, 2) of a second board's, to the right of it; None: there is none"""
     ink: Mask
     """(H, W) where ink is, at least half opaque"""
     clean: Mask
@@ -52,13 +56,17 @@ class Scene:
     """kind of frame"""
 
 
-def scene(seed: int, *, board: bool = True, dirty: bool | None = None) -> Scene:
+def scene(
+    seed: int, *, board: bool = True, dirty: bool | None = None, two: bool = False, dazzled: bool = False
+) -> Scene:
     """One random picture.
 
     Args:
         seed: the same seed, the same picture.
         board: False: the room alone.
         dirty: with writing or without; None: four of five have some.
+        two: two boards of one height beside each other, often of one make, their frames up to 20 mm apart.
+        dazzled: light so strong that the picture is white lies over a whole side of the board, frame and wall.
     """
     rng = np.random.default_rng(seed)
     written = bool(rng.random() < 0.8) if dirty is None else dirty
@@ -69,8 +77,9 @@ def scene(seed: int, *, board: bool = True, dirty: bool | None = None) -> Scene:
     bare = np.zeros_like(ink)
     kind = ""
     if board:
-        size = _size(rng)
-        texture, alpha, marks, spoiled, inner, kind = _board(rng, size, surface, written)
+        texture, alpha, marks, spoiled, inner, kind = (
+            _pair(rng, surface, written) if two else _board(rng, _size(rng), surface, written)
+        )
         H = _view(rng, texture.shape[1], texture.shape[0])
         full = (2 * WIDTH, 2 * HEIGHT)
         seen = cv2.warpPerspective(texture, H, full, flags=cv2.INTER_LINEAR)
@@ -79,19 +88,23 @@ def scene(seed: int, *, board: bool = True, dirty: bool | None = None) -> Scene:
         room = room * (1.0 - opaque) + seen * opaque
         ink = cv2.warpPerspective(marks, H, full, flags=cv2.INTER_LINEAR)
         surface_mask = np.zeros(alpha.shape, np.uint8)
-        cv2.fillConvexPoly(surface_mask, np.int32(np.rint(inner)), 255)
+        for corners in inner.reshape(-1, 4, 2):
+            cv2.fillConvexPoly(surface_mask, np.int32(np.rint(corners)), 255)
         surface_mask[cv2.dilate(spoiled, np.ones((25, 25), np.uint8)) > 0] = 0
         bare = cv2.erode(
             cv2.warpPerspective(surface_mask, H, full, flags=cv2.INTER_NEAREST), np.ones((25, 25), np.uint8)
         )
         truth = cv2.perspectiveTransform(inner[None].astype(np.float64), H)[0]
-        room, covered = _in_front(rng, room, truth)
+        room, covered = _in_front(rng, room, truth[:4])
         bare[covered > 0] = 0
         ink[covered > 0] = 0
-        room = _glare(rng, room, truth)
+        room = _glare(rng, room, truth[:4])
+        if dazzled:
+            room = _dazzle(rng, room, truth[:4])
     room = _light(rng, room)
     image, (ink, bare), truth = _camera(rng, room, (ink, bare), truth)
-    return Scene(image, truth, ink > 127, bare > 127, bool(written and board), kind)
+    first, beside = (None, None) if truth is None else (truth[:4], truth[4:] if two else None)
+    return Scene(image, first, beside, ink > 127, bare > 127, bool(written and board), kind)
 
 
 def _white(rng: np.random.Generator) -> Array:
@@ -186,28 +199,66 @@ def _object(rng: np.random.Generator, room: Float, colour: tuple[float, ...]) ->
         cv2.polylines(room, [np.int32(points)], False, colour, int(rng.integers(2, 14)), cv2.LINE_AA)
 
 
-def _board(
-    rng: np.random.Generator, size: tuple[int, int], surface: Array, written: bool
+def _pair(
+    rng: np.random.Generator, surface: Array, written: bool
 ) -> tuple[Float, Float, Image, Image, Array, str]:
-    """Texture with frame, its opacity, ink, everything on the surface, corners of the surface, kind of frame."""
+    """Two boards beside each other on one wall, as `_board`; (8, 2) corners."""
+    width, high = rng.uniform(600, 1300, 2), round(rng.uniform(700, 1000))
+    if rng.random() < 0.5:
+        width[1] = width[0]
+    make = int(rng.integers(1 << 30))
+    makes = (make, make + (rng.random() < 0.3))
+    gap = round(rng.uniform(0, 20)) if rng.random() < 0.7 else 0
+    left, right = (
+        _board(rng, (round(w), high), surface, written, np.random.default_rng(m))
+        for w, m in zip(width, makes, strict=True)
+    )
+    rows = max(left[0].shape[0], right[0].shape[0])
+    begin = 0, left[0].shape[1] - 2 * MARGIN + gap  # the margins overlap
+    columns = begin[1] + right[0].shape[1]
+    texture = np.zeros((rows, columns, 3), np.float32)
+    alpha = np.zeros((rows, columns), np.float32)
+    marks, spoiled = np.zeros((2, rows, columns), np.uint8)
+    inner = []
+    for board, x in zip((left, right), begin, strict=True):
+        y = (rows - board[0].shape[0]) // 2
+        solid = board[1] > 0.0
+        part = np.s_[y : y + solid.shape[0], x : x + solid.shape[1]]
+        for whole, own in zip((texture, alpha, marks, spoiled), board[:4], strict=True):
+            whole[part][solid] = own[solid]
+        inner.append(board[4] + [x, y])
+    return texture, alpha, marks, spoiled, np.concatenate(inner), left[5]
+
+
+def _board(
+    rng: np.random.Generator,
+    size: tuple[int, int],
+    surface: Array,
+    written: bool,
+    make: np.random.Generator | None = None,
+) -> tuple[Float, Float, Image, Image, Array, str]:
+    """Texture with frame, its opacity, ink, everything on the surface, corners of the surface, kind of frame.
+
+    `make` draws the frame; None: `rng` does.
+    """
     w, h = size
-    kind = str(rng.choice(["aluminium", "thin", "wood", "white", "none"], p=[0.5, 0.15, 0.12, 0.13, 0.1]))
+    make = make or rng
+    kind = str(make.choice(["aluminium", "thin", "wood", "white", "none"], p=[0.5, 0.15, 0.12, 0.13, 0.1]))
     width = {
-        "aluminium": rng.uniform(15, 75),
-        "thin": rng.uniform(7, 16),
-        "wood": rng.uniform(25, 80),
-        "white": rng.uniform(20, 60),
+        "aluminium": make.uniform(15, 75),
+        "thin": make.uniform(7, 16),
+        "wood": make.uniform(25, 80),
+        "white": make.uniform(20, 60),
         "none": 4.0,
     }[kind]
     f = round(min(width, 0.07 * min(w, h)))
-    margin = 40
-    o = f + margin
+    o = f + MARGIN
     texture = np.ones((h + 2 * o, w + 2 * o, 3), np.float32) * surface.astype(np.float32)
     alpha = np.zeros(texture.shape[:2], np.float32)
-    outer = (slice(margin, h + 2 * f + margin), slice(margin, w + 2 * f + margin))
+    outer = (slice(MARGIN, h + 2 * f + MARGIN), slice(MARGIN, w + 2 * f + MARGIN))
     alpha[outer] = 1.0
     inside = (slice(o, o + h), slice(o, o + w))
-    _frame(rng, texture, kind, f, margin, surface)
+    _frame(make, texture, kind, f, MARGIN, surface)
     face = texture[inside]
     face[:] = surface * (1.0 + 0.01 * _smooth(rng, (h, w), 5)[..., None])
     marks = np.zeros((h, w), np.uint8)
@@ -222,7 +273,7 @@ def _board(
         y = np.arange(h, dtype=np.float32)[:, None, None] / depth
         face *= 1.0 - rng.uniform(0.05, 0.25) * np.exp(-(y**2))
     if kind != "none" and rng.random() < 0.5:
-        _caps(rng, texture, alpha, f, margin)
+        _caps(rng, texture, alpha, f, MARGIN)
     whole = np.zeros(alpha.shape, np.uint8)
     dirt = np.zeros(alpha.shape, np.uint8)
     whole[inside], dirt[inside] = marks, spoiled
@@ -448,6 +499,21 @@ def _glare(rng: np.random.Generator, room: Float, corners: Array) -> Float:
     return room
 
 
+def _dazzle(rng: np.random.Generator, room: Float, corners: Array) -> Float:
+    """The sun over a whole side."""
+    k = int(rng.integers(0, 4))
+    a, b = corners[k], corners[(k + 1) % 4]
+    middle = corners.mean(0)
+    along, inward = b - a, middle - 0.5 * (a + b)
+    out, deep = rng.uniform(0.03, 0.4, 2)
+    ends = np.array([a - 0.1 * along, b + 0.1 * along])
+    band = np.concatenate([ends - out * inward, ends[::-1] + deep * inward])
+    layer = np.zeros(room.shape[:2], np.float32)
+    cv2.fillPoly(layer, [np.int32(np.rint(band + rng.normal(0.0, 15.0, (4, 2))))], 1.0)
+    layer = _blurred(layer, float(np.exp(rng.uniform(np.log(5), np.log(50)))))
+    return room + np.float32(rng.uniform(120, 400)) * layer[..., None]
+
+
 def _light(rng: np.random.Generator, room: Float) -> Float:
     """Lamps far and near, shadows of things out of view, white balance, exposure."""
     h, w = room.shape[:2]
@@ -490,8 +556,8 @@ def _camera(
     room = cv2.remap(room, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     masks = tuple(cv2.remap(m, maps, None, cv2.INTER_LINEAR) for m in masks)
     if corners is not None:
-        rays = np.column_stack([(corners - K[:2, 2]) / K[0, 0], np.ones(4)])
-        corners = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, k)[0].reshape(4, 2)
+        rays = np.column_stack([(corners - K[:2, 2]) / K[0, 0], np.ones(len(corners))])
+        corners = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, k)[0].reshape(-1, 2)
         corners = (corners + 0.5) / 2.0 - 0.5
     small = cv2.resize(room, (w // 2, h // 2), interpolation=cv2.INTER_AREA)
     masks = tuple(cv2.resize(m, (w // 2, h // 2), interpolation=cv2.INTER_AREA) for m in masks)

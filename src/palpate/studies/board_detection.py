@@ -29,13 +29,18 @@ from ._rows import at_most, told
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-VIEWS, ROOMS, TIMED = 500, 100, 40
-"""rendered views with a board, rooms without one, frames for the time"""
-QUICK = (8, 4, 4)
+VIEWS, ROOMS, HARD, TIMED = 500, 100, 100, 40
+"""rendered views with a board, rooms without one, views of each hard kind, frames for the time"""
+QUICK = (8, 4, 4, 4)
 FITTED = 100_000
 """first seed of the views that thresholds and weights were set on; none of them is measured here"""
 EMPTY = 50_000
 """first seed of the rooms without a board"""
+PAIRS, DAZZLED = 60_000, 70_000
+"""first seeds of the views of two boards beside each other, and of boards with light as white as the picture gets over
+a side"""
+BELIEVED = 0.8
+"""confidence of a board from which a job believes in it"""
 WITHIN = 3.0
 """[pixels] at 1280x720"""
 SHARE = 97.0
@@ -142,6 +147,35 @@ def measure_room(seed: int) -> float:
     return 0.0 if sight.board is None else sight.board.confidence
 
 
+def measure_pair(seed: int) -> tuple[bool, float]:
+    """Of two boards beside each other: whether both are found, and the confidence of one that spans both, 0: none."""
+    cv2.setNumThreads(1)
+    scene = _boards.scene(seed, two=True)
+    pair = scene.corners, scene.beside
+    found = detect(scene.image)
+    both = all(
+        any(corner_error(b.corners, true) <= NEARBY for b in found) for true in pair if true is not None
+    )
+    spans = [b.confidence for b in found if all(_holds(b.corners, true) for true in pair if true is not None)]
+    return both, max(spans, default=0.0)
+
+
+def _holds(corners: Array, other: Array) -> bool:
+    """The middle of the other lies in it."""
+    x, y = other.mean(0)
+    return cv2.pointPolygonTest(corners.astype(np.float32), (float(x), float(y)), False) >= 0.0
+
+
+def measure_dazzled(seed: int) -> tuple[float, Array, Array]:
+    """Of a board with a side in burnt light: its confidence, 0 if none is found, its corners' errors and deviations."""
+    cv2.setNumThreads(1)
+    scene = _boards.scene(seed, dazzled=True)
+    found = detect(scene.image)
+    if not found or scene.corners is None:
+        return 0.0, np.zeros(0), np.zeros(0)
+    return found[0].confidence, corner_errors(found[0].corners, scene.corners), found[0].sigma
+
+
 def measure_photo(job: tuple[str, dict[str, Any]]) -> Photo:
     """Look at an annotated photograph."""
     folder, note = job
@@ -220,13 +254,15 @@ def _times(count: int) -> tuple[Array, Array]:
 
 def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure], list[str]]:
     """Measure."""
-    views, rooms, timed = QUICK if quick else (VIEWS, ROOMS, TIMED)
+    views, rooms, hard, timed = QUICK if quick else (VIEWS, ROOMS, HARD, TIMED)
     photographs = _photographs()
-    with Work(progress, views + rooms + len(photographs)) as work:
+    with Work(progress, views + rooms + 2 * hard + len(photographs)) as work:
         seen = work.map(measure_view, range(views))
         empty = np.array(work.map(measure_room, range(EMPTY, EMPTY + rooms)))
+        pairs = work.map(measure_pair, range(PAIRS, PAIRS + hard))
+        dazzled = work.map(measure_dazzled, range(DAZZLED, DAZZLED + hard))
         photos = work.map(measure_photo, photographs)
-    rows = [*_rendered(seen, empty), *_photos(photos)]
+    rows = [*_rendered(seen, empty), *_hard(pairs, dazzled), *_photos(photos)]
     board, whole = _times(timed)
     rows.append(
         at_most(
@@ -302,6 +338,7 @@ def _rendered(seen: list[View], empty: Array) -> list[Row]:
             int((empty > 0).sum()),
             "",
             beside=f"0 of {len(empty)}",
+            note=f"panels and posters; with a confidence of {BELIEVED:g} or more {int((empty >= BELIEVED).sum())}",
         ),
         told("rendered: clean or dirty right", 100.0 * float(np.mean(verdicts)), "%"),
         told(
@@ -311,6 +348,45 @@ def _rendered(seen: list[View], empty: Array) -> list[Row]:
             "mean over the views with ink",
         ),
         told("rendered: clean surface taken for ink, by pixels", 100.0 * float(np.nanmean(alarm)), "%"),
+    ]
+
+
+def _hard(pairs: list[tuple[bool, float]], dazzled: list[tuple[float, Array, Array]]) -> list[Row]:
+    """Two boards beside each other; a side in burnt light."""
+    spans = np.array([confidence for _, confidence in pairs])
+    found = [d for d in dazzled if d[0] > 0.0]
+    off, sigma = (np.concatenate([d[k] for d in found]) if found else np.zeros(0) for k in (1, 2))
+    wrong = [d for d in found if d[1].max() > NEARBY]
+    blind = sum(d[0] >= BELIEVED and bool(np.any(d[1] > np.maximum(2.0 * d[2], WITHIN))) for d in found)
+    return [
+        told(
+            "rendered: two boards beside each other, both found",
+            100.0 * float(np.mean([both for both, _ in pairs])),
+            "%",
+            f"{len(pairs)} views",
+        ),
+        told(
+            "rendered: two boards beside each other taken for one",
+            int((spans > 0.0).sum()),
+            "",
+            beside=f"0 of {len(pairs)}",
+            note=f"with a confidence of {BELIEVED:g} or more {int((spans >= BELIEVED).sum())}",
+        ),
+        told(
+            "rendered: a side in burnt light, corners off by at most twice their stated deviation",
+            100.0 * float(np.mean(off <= 2.0 * sigma)) if len(off) else float("nan"),
+            "%",
+            beside="98.2",
+            note=f"{len(dazzled)} views, no board in {len(dazzled) - len(found)}; corners more than {NEARBY:g} px "
+            f"off in {len(wrong)}",
+        ),
+        told(
+            "rendered: a side in burnt light, a wrong corner stated as right",
+            blind,
+            "",
+            beside=f"0 of {len(dazzled)}",
+            note=f"confidence {BELIEVED:g} or more, off by more than {WITHIN:g} px and twice the stated deviation",
+        ),
     ]
 
 

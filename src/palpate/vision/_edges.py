@@ -50,6 +50,12 @@ NEAR = 0.02
 """loss by a square pixel, relative to being wrong"""
 LEFT = 0.25
 """what blur, compression and the lens leave of the place of the sharpest corner, standard deviation [pixels]"""
+BURNT = 250.0
+"""brightness from which nothing can be told apart [grey levels]"""
+BLIND = 12.0
+"""a burnt stretch this near to an edge may hide the border [pixels]"""
+BOTH_WAYS, BLIND_ROWS = 0.6, 120
+"""and is followed so far outward and inward, relative to the board, in so many rows"""
 BOW = 0.4
 """a side is straight if its middle is nearer to its chord [pixels]"""
 
@@ -124,6 +130,8 @@ class Edges:
     """(4,) deviation of the edge from the fitted line [pixels]"""
     sigma: Array
     """(4,) standard deviation of the corners [pixels]"""
+    blind: Array
+    """(4,) width of what is as white as a picture gets along a side: the border may be anywhere in it [pixels]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +145,8 @@ class _Side:
     """deviation of the edge points from it [pixels]"""
     sigma: float
     """standard deviation of its place [pixels]"""
+    blind: float = 0.0
+    """[pixels]"""
 
     @property
     def inward(self) -> Array:
@@ -157,14 +167,14 @@ def fit(grey: Image, corners: Array, border: Mask) -> Edges:
     if max(map(abs, lean)) > ASKEW:
         sides, met = _around(grey, met, border)
     sigma = np.array([_corner_sigma(sides[k - 1], sides[k]) for k in range(4)])
-    return Edges(met, np.array([s.spread for s in sides]), sigma)
+    return Edges(met, np.array([s.spread for s in sides]), sigma, np.array([s.blind for s in sides]))
 
 
 def _around(grey: Image, corners: Array, border: Mask) -> tuple[list[_Side], Array]:
     """The sides found near the rough ones, and the corners (4, 2) where they meet."""
     strips = _strips(grey, corners)
     sides = [
-        _Side(corners[k], corners[(k + 1) % 4], 0.0, 0.0, 0.0) if border[k] else _side(strips, k)
+        _Side(corners[k], corners[(k + 1) % 4], 0.0, 0.0, 0.0) if border[k] else _side(grey, strips, k)
         for k in range(4)
     ]
     return sides, np.array([_corner(sides[k - 1], sides[k]) for k in range(4)])
@@ -385,11 +395,13 @@ def _chances(features: Array) -> Array:
     return is_one * np.cumprod(np.append(1.0, 1.0 - is_one))[:-1]
 
 
-def _side(strips: _Strips, k: int) -> _Side:
+def _side(grey: Image, strips: _Strips, k: int) -> _Side:
     """The border along side k."""
     found = _candidates(strips, k)
     if not len(found.row):
-        return _Side(strips.corners[k], strips.corners[(k + 1) % 4], 0.0, 0.0, LEAST_OUTWARD)
+        p, q = strips.corners[k], strips.corners[(k + 1) % 4]
+        blind = _blind(grey, strips, k, 0.0)
+        return _Side(p, q, 0.0, 0.0, float(np.hypot(LEAST_OUTWARD, blind / np.sqrt(3.0))), blind)
     chance = _chances(found.features)
     place = strips.first[k] + PITCH * found.row
     best, left = _least_loss(place, chance)
@@ -398,7 +410,34 @@ def _side(strips: _Strips, k: int) -> _Side:
     curve[0] += best - place[i]
     ends = np.array([[0.0, curve[0]], [1.0, curve.sum()]]) / [1.0, strips.extent[k]]
     p, q = mapped(strips.H[k][None], ends)[0]
-    return _Side(p, q, float(curve[2]), spread, float(np.sqrt(spread**2 / points + left)))
+    blind = _blind(grey, strips, k, best)
+    # the edge found is one end of what is blind, the border anywhere in it
+    sigma = float(np.sqrt(spread**2 / points + left + blind**2 / 3.0))
+    return _Side(p, q, float(curve[2]), spread, sigma, blind)
+
+
+def _blind(grey: Image, strips: _Strips, k: int, place: float) -> float:
+    """How far the picture is burnt across side k from an edge at `place` [pixels]; 0 if the whole surface is."""
+    level = strips.level[k]
+    row = (place - strips.first[k]) / PITCH + 1.0
+    near = level[max(round(row - BLIND / PITCH), 0) : round(row + BLIND / PITCH) + 1]
+    deepest = strips.level[np.arange(4), strips.rows]
+    if near.max() < BURNT or deepest.min() >= BURNT:
+        return 0.0
+    size = (STRETCHES * EACH // 3, BLIND_ROWS)
+    wide = _strip(grey, strips.H[k], (ENDS, 1.0 - ENDS), (-BOTH_WAYS, BOTH_WAYS), size)
+    burnt = np.median(wide, 1) >= BURNT
+    pitch = 2.0 * BOTH_WAYS * float(strips.extent[k]) / (BLIND_ROWS - 1)
+    middle = place / pitch + 0.5 * (BLIND_ROWS - 1)
+    at = np.flatnonzero(burnt)
+    if not len(at):
+        return 0.0
+    begin = end = int(at[np.abs(at - middle).argmin()])
+    while begin > 0 and burnt[begin - 1]:
+        begin -= 1
+    while end < BLIND_ROWS - 1 and burnt[end + 1]:
+        end += 1
+    return pitch * (end - begin + 1)
 
 
 def _least_loss(place: Array, chance: Array) -> tuple[float, float]:

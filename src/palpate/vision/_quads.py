@@ -27,6 +27,12 @@ GRID = 12
 """points per direction at which the inside is looked at"""
 LEAST_SINE = 0.42
 """of the angle between neighbouring sides"""
+TINT = 0.2
+"""saturation that a lamp's colour gives a white surface"""
+WHITE = 0.65
+"""a white surface in the shade has this part of the picture's brightest level"""
+BURNT = 250
+"""a pixel with all channels above is as white as it gets"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +59,11 @@ FEATURES = (
     "coloured",  # saturation of the surface
     "size",  # log of the area
     "contrast",  # other brightness outside than inside, mean over sides
+    "painted",  # saturation of the surface beyond what a lamp's colour gives white
+    "dark",  # surface against the brightest of the picture, by which it is less than WHITE
+    "burnt",  # part of the inside that is as white as the picture can be, beyond half: a lamp, a window, the sun
 )
-WEIGHTS = np.array([7.5, 5.4, 4.6, 0.8, 2.5, 3.1, -4.2, 1.2, 2.0])
+WEIGHTS = np.array([7.5, 5.4, 4.6, 0.8, 2.5, 3.1, -4.2, 1.2, 2.0, -12.0, -8.0, -12.0])
 BIAS = -17.9
 
 
@@ -99,15 +108,21 @@ def find(lines: Lines, gradient: Gradient, image: Image, grey: Image) -> Quads:
     )
     best = np.argsort(-quick, kind="stable")[:SHORTLIST]
     order, corners, supports, junctions, area = (x[best] for x in (order, corners, supports, junctions, area))
-    inside = _inside(corners, image, grey, gradient)
+    flat, even, bright, coloured, burnt = _inside(corners, image, grey, gradient)
     features = np.column_stack(
         [
             supports.mean(1),
             supports.min(1),
             junctions.mean(1),
-            *inside,
+            flat,
+            even,
+            bright,
+            coloured,
             np.log(area / (width * height)),
             _contrast(corners, grey),
+            np.maximum(coloured - TINT, 0.0),
+            np.maximum(WHITE - bright, 0.0),
+            np.maximum(burnt - 0.5, 0.0),
         ]
     )
     score = features @ WEIGHTS + BIAS
@@ -221,8 +236,8 @@ def picked(channel: Image | Float, points: Array) -> Array:
 
 def _inside(
     corners: Array, image: Image, grey: Image, gradient: Gradient
-) -> tuple[Array, Array, Array, Array]:
-    """Flat part, part explained by a smooth surface, brightness, saturation."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Flat part, part explained by a smooth surface, brightness, saturation, burnt part."""
     u = np.linspace(0.05, 0.95, GRID)
     grid = np.stack(np.meshgrid(u, u), -1).reshape(-1, 2)
     at = mapped(homographies(corners), grid)
@@ -247,7 +262,7 @@ def _inside(
     blue, green, red = (picked(image[..., c], at) for c in range(3))
     top, bottom = np.maximum(np.maximum(blue, green), red), np.minimum(np.minimum(blue, green), red)
     colour = ((1.0 - bottom / np.maximum(top, 1.0)) * surface).sum(1) / count
-    return flat.mean(1), even, bright, colour
+    return flat.mean(1), even, bright, colour, (bottom >= BURNT).mean(1)
 
 
 def _contrast(corners: Array, grey: Image) -> Array:

@@ -23,6 +23,8 @@ METHODS: tuple[Method, ...] = ("lines", "published", "saturation", "value")
 
 DIRTY = 5e-4
 """part of the surface under ink from which a board is dirty: 5 cm of a 3 mm stroke on 60 cm x 45 cm"""
+DIVIDED = 0.1
+"""chance of two boards instead of one from which it is told"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,11 @@ class Sight:
         said = []
         if len(self.boards) > 1:
             said.append(f"{len(self.boards)} boards are in view; the first one is the best supported")
+        if self.board is not None and self.board.divided > DIVIDED:
+            said.append(
+                f"a band runs across the board from border to border: two boards by a chance of "
+                f"{100.0 * self.board.divided:.0f} %"
+            )
         if self.board is not None and not self.board.complete:
             said.append("the board is partly out of view: where the picture ends is not the board's edge")
         if self.board is not None and self.plane is not None and self.plane.camera is None:
@@ -99,6 +106,7 @@ class Sight:
                     "corners_px": rounded(b.corners, 2),
                     "corners_sigma_px": None if np.isnan(b.sigma).any() else rounded(b.sigma, 2),
                     "confidence": round(b.confidence, 4),
+                    "divided": round(b.divided, 4),
                     "complete": b.complete,
                     "side_in_view": b.in_view.tolist(),
                 }
