@@ -131,7 +131,7 @@ def test_the_same_seed_is_the_same_board():
     ("wrong", "words"),
     [
         ({"speed": 0.0}, "speed"),
-        ({"speed": 100.0}, "at most 0.3 m/s"),
+        ({"speed": 100.0}, "at most 0.25 m/s"),
         ({"normal_force": 5.0}, "normal_force"),
         ({"passes": 0}, "passes"),
         ({"hold": "perhaps"}, "always, needed, never"),
@@ -172,7 +172,9 @@ def test_a_short_job_from_pixels_to_a_clean_board_with_a_pause_in_it():
     assert result.verdict == "clean" and not result.resumable and result.reason == ""
     assert result.ink_left == 0.0 and result.ink_after == scene.ink.area == 0.0
     assert result.before.sight.dirty and not result.after.sight.ink_polygons
-    assert told(result, "pass 1: 1 stroke, about")
+    (only,) = result.passes
+    assert told(result, f"pass 1: {only.plan.summary}, about")
+    assert only.plan.summary.startswith("1 stroke of ")
     # the bounds hold, felt by nothing but the joints
     track = result.track
     assert track.force.max() <= 5.0 and track.moment.max() <= 2.0

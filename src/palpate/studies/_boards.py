@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -219,13 +220,14 @@ def _pair(
     texture = np.zeros((rows, columns, 3), np.float32)
     alpha = np.zeros((rows, columns), np.float32)
     marks, spoiled = np.zeros((2, rows, columns), np.uint8)
+    layers: tuple[npt.NDArray[Any], ...] = texture, alpha, marks, spoiled
     inner = []
     for board, x in zip((left, right), begin, strict=True):
         y = (rows - board[0].shape[0]) // 2
         solid = board[1] > 0.0
         part = np.s_[y : y + solid.shape[0], x : x + solid.shape[1]]
-        for whole, own in zip((texture, alpha, marks, spoiled), board[:4], strict=True):
-            whole[part][solid] = own[solid]
+        for layer, own in zip(layers, board, strict=False):
+            layer[part][solid] = np.asarray(own)[solid]
         inner.append(board[4] + [x, y])
     return texture, alpha, marks, spoiled, np.concatenate(inner), left[5]
 

@@ -181,6 +181,20 @@ def control_step() -> float:
     return 1e6 * best
 
 
+def effective_mass() -> tuple[float, float]:
+    """Least and largest force per acceleration of the eraser in the plane of a level board [kg], over the board."""
+    scene = wipe.BoardScene(wipe.InkLayer((0.45, 0.31)))
+    arm, (width, height) = scene.arms[0], scene.ink.size
+    spots = [(u * width, v * height, 0.0) for u in (0.1, 0.5, 0.9) for v in (0.1, 0.5, 0.9)]
+    wanted = wipe.tool_poses(np.array(spots), scene.T_base_board(0), 0.0)
+    poses = [q for T in wanted if (q := wipe.inverse_kinematics(arm, T)) is not None]
+    scene.close()
+    angle = np.linspace(0.0, np.pi, 16, endpoint=False)
+    ways = np.stack([np.cos(angle), np.sin(angle), np.zeros(16)])
+    force = np.linalg.norm(wipe.tool_inertia(arm, np.array(poses))[:, :3, :3] @ ways, axis=1)
+    return float(force.min()), float(force.max())
+
+
 def made_by() -> str:
     """What results depend on: the compiled core, and the sources of seeing, simulating and wiping."""
     digest = hashlib.sha256(Path(str(_core.__file__)).read_bytes())
@@ -227,6 +241,15 @@ def run(
     rows.append(
         at_most(
             "control step of the core while it presses", STEPS, control_step(), "us", "quietest of 20 rounds"
+        )
+    )
+    least, largest = effective_mass()
+    rows.append(
+        told(
+            "force over acceleration of the eraser along a level board, largest",
+            largest,
+            "kg",
+            f"least {least:.2g} kg, nine places, every direction",
         )
     )
     pace = float(np.median([f.wall / f.simulated for f in found.values()]))

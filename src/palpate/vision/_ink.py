@@ -60,10 +60,18 @@ class Ink:
     """(len(polygons),) part of the light that the piece takes away, at its core"""
 
 
-def find(image: Image, corners: Array, *, faint: float = FAINT, clear: float = CLEAR) -> Ink:
+def find(
+    image: Image,
+    corners: Array,
+    *,
+    faint: float = FAINT,
+    clear: float = CLEAR,
+    least: int | None = None,
+) -> Ink:
     """Ink in a picture (H, W, 3) within the quadrangle corners (4, 2) [pixels].
 
     `faint` and `clear`: part of the light that the weakest and the core of a stroke take away, at least.
+    `least`: pixels of a piece at least; None: SPECK, and more of a faint one.
     """
     height, width = image.shape[:2]
     low = np.clip(np.floor(corners.min(0)).astype(int) - 2, 0, None)
@@ -98,7 +106,18 @@ def find(image: Image, corners: Array, *, faint: float = FAINT, clear: float = C
         weak |= patches
         taken = cv2.max(taken, cv2.bitwise_and(below, below, mask=patches))
     ink = _pieces(
-        board, weak, taken, below, things, core, corners - low, low, (height, width), shorter, edge / 2.0
+        board,
+        weak,
+        taken,
+        below,
+        things,
+        core,
+        corners - low,
+        low,
+        (height, width),
+        shorter,
+        edge / 2.0,
+        least,
     )
     found, _ = cv2.findContours(things, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     solid = tuple(3.0 * f.reshape(-1, 2) + 1.0 + low for f in found)
@@ -220,6 +239,7 @@ def _pieces(
     shape: tuple[int, int],
     shorter: float,
     margin: float,
+    least: int | None,
 ) -> Ink:
     """Connected pieces that are clear somewhere, sorted into ink and other things."""
     mask = np.zeros(shape, bool)
@@ -251,12 +271,8 @@ def _pieces(
     last = np.array(around.shape[::-1]) - 1
     at = np.minimum(points // 3, last)
     beside = np.add.reduceat(around[at[:, 1], at[:, 0]].astype(np.float32), begin) > 0.3 * area
-    good = (
-        (hits >= np.maximum(3.0, 0.1 * area))
-        & (area >= SPECK * np.maximum(1.0, GRAIN / np.maximum(strength, 1e-3)))
-        & ~rim
-        & ~beside
-    )
+    enough = SPECK * np.maximum(1.0, GRAIN / np.maximum(strength, 1e-3)) if least is None else float(least)
+    good = (hits >= np.maximum(3.0, 0.1 * area)) & (area >= enough) & ~rim & ~beside
     wide = THING * shorter + 1.5
     outlines, filled, uneven = {}, np.zeros(len(good)), np.zeros(len(good))
     for i in np.flatnonzero(good):

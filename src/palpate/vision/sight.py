@@ -196,7 +196,12 @@ def _plane(
 
 
 def ink(
-    image: npt.ArrayLike, corners: npt.ArrayLike, *, faint: float = _ink.FAINT, clear: float = _ink.CLEAR
+    image: npt.ArrayLike,
+    corners: npt.ArrayLike,
+    *,
+    faint: float = _ink.FAINT,
+    clear: float = _ink.CLEAR,
+    least: int | None = None,
 ) -> Ink:
     """Ink on a writing surface.
 
@@ -206,9 +211,11 @@ def ink(
         faint: part of the light, 0 to 1, that the weakest of a piece of ink takes away at least; less finds fainter
             rests, and marks of the surface too.
         clear: part that its core takes away at least.
+        least: pixels of a piece, at 1280 pixels of the picture's longer side at most; None: 9, and more the fainter it
+            is, because dust and grain are specks.
 
     Raises:
-        InputError: not a picture; corners of another shape; not 0 < faint <= clear < 1.
+        InputError: not a picture; corners of another shape; not 0 < faint <= clear < 1; least below 1.
     """
     picture = checked(image)
     q = np.asarray(corners, np.float64)
@@ -216,8 +223,10 @@ def ink(
         raise InputError(f"corners must be (4, 2) and finite, got {q.shape}")
     if not 0.0 < faint <= clear < 1.0:
         raise InputError(f"ink: expected 0 < faint <= clear < 1, got {faint!r} and {clear!r}")
+    if least is not None and least < 1:
+        raise InputError(f"ink: least must be at least 1 pixel, got {least!r}")
     fine, scale = shrunk(picture, board.FINE)
-    found = _ink.find(fine, rescaled(q, scale), faint=faint, clear=clear)
+    found = _ink.find(fine, rescaled(q, scale), faint=faint, clear=clear, least=least)
     if scale == 1.0:
         return found
     mask = cv2.resize(

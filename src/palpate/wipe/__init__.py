@@ -29,7 +29,7 @@ from .film import Film, Video
 from .ink import InkLayer, handwriting
 from .job import WipeJob
 from .options import JobOptions
-from .reach import Reach, inverse_kinematics, paced, reachable, tool_poses
+from .reach import Reach, inverse_kinematics, paced, reachable, tool_inertia, tool_poses
 from .record import RunRecorder
 from .result import Event, JobResult, Look, Observer, Pass, Tick, Timing, Track
 from .scene import BoardScene, Setting
@@ -72,5 +72,6 @@ __all__ = [
     "report",
     "summary",
     "swept",
+    "tool_inertia",
     "tool_poses",
 ]

@@ -622,9 +622,8 @@ class Mediator(Activity):
         self._begin_wiping()
         seen = self.looks[-1].sight.covered
         self._passed("begun", route.plan, seen)
-        strokes = len(route.plan.strokes) if route.plan is not None else 0
-        many = "1 stroke" if strokes == 1 else f"{strokes} strokes"
-        self._tell("task", f"pass {self.number}: {many}, about {self.wipe.total:.0f} s")
+        strokes = "" if route.plan is None else f"{route.plan.summary}, "
+        self._tell("task", f"pass {self.number}: {strokes}about {self.wipe.total:.0f} s")
 
     def _begin_wiping(self) -> None:
         assert self.wipe is not None

@@ -9,8 +9,8 @@ from typing import Literal
 from ..errors import InputError
 from .strokes import Motion
 
-FASTEST = 0.3
-"""[m/s]"""
+FASTEST = 0.25
+"""the force is measured up to this speed, `palpate bench wipe` [m/s]"""
 
 
 @dataclass(frozen=True, slots=True)

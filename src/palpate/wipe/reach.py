@@ -147,8 +147,7 @@ def paced(
     for leg in plan.legs:
         count = _count(leg)
         poses, first = reach.q[first : first + count], first + count
-        J = arm.jacobian(poses, arm.grasp)
-        inertia = np.linalg.inv(J @ np.linalg.solve(arm.mass_matrix(poses), J.swapaxes(1, 2)))
+        inertia = tool_inertia(arm, poses)
         way = R @ ((leg.end - leg.start) * [1.0, 1.0, -1.0] / max(leg.length, 1e-9))
         force = np.linalg.norm(inertia[:, :3, :3] @ way, axis=1).max()
         moment = np.linalg.norm(inertia[:, 3:, :3] @ way, axis=1).max()
@@ -157,6 +156,15 @@ def paced(
         most = (1.0 - RESERVE) * min(free / max(force, 1e-9), max_torque / max(moment, 1e-9))
         legs.append(replace(leg, acceleration=min(leg.acceleration, float(most))))
     return tuple(legs)
+
+
+def tool_inertia(arm: Arm, q: npt.ArrayLike) -> Array:
+    """Lambda = (J M^-1 J^T)^-1 at the grasp point, (N, 6, 6), base axes, for joint positions (N, n) [rad].
+
+    Force [N] and moment [N m] that its acceleration [m/s^2], [rad/s^2] takes (Khatib 1987).
+    """
+    J = arm.jacobian(q, arm.grasp)
+    return np.linalg.inv(J @ np.linalg.solve(arm.mass_matrix(q), J.swapaxes(1, 2)))
 
 
 def inverse_kinematics(

@@ -13,6 +13,7 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 import numpy.typing as npt
+import shapely
 
 from .. import vision
 from ..arm import Array
@@ -23,7 +24,7 @@ from .options import JobOptions
 from .reach import inverse_kinematics, paced, reachable, tool_poses
 from .result import Look
 from .scene import FRAME, THICK, BoardScene
-from .strokes import Eraser, Motion, Plan, plan
+from .strokes import Eraser, Motion, Plan, plan, shape
 
 Question = TypeVar("Question")
 Answer = TypeVar("Answer")
@@ -41,6 +42,10 @@ FRAMES = 5
 FAINT, CLEAR = 0.012, 0.02
 """part of the light that the weakest and the core of what is left of ink take away, at least: a twentieth of a layer of
 ink takes 0.04, half of it where it is no wider than a pixel"""
+REST_FAINT, REST_CLEAR, REST = 0.010, 0.015, 6
+"""the same where ink was, and pixels of a rest at least: elsewhere so small and pale a speck is the surface's own"""
+WAS = 0.004
+"""where ink was, and so far beside it [m]"""
 FREE = 0.003
 """a hand about to take the board keeps so far from everything [m]"""
 MARGINS = (0.4, 0.05)
@@ -108,6 +113,8 @@ class Perception(Slow[str, Look]):
         self._camera = scene.camera
         self._why: str | None = None
         self._frames: list[npt.NDArray[np.uint8]] = []
+        self._was = shapely.Polygon()
+        """where ink was seen (board coordinates)"""
 
     def ready(self) -> str | None:
         """A picture in each cycle, until there are enough for what they are for."""
@@ -133,11 +140,29 @@ class Perception(Slow[str, Look]):
                 image = frames[-1]  # somebody is in front of the board: noise, but no ghosts
                 sight = vision.see(image, size=size, camera=self._camera)
             if question == "after" and sight.board is not None:
-                rests = vision.ink(image, sight.board.corners, faint=FAINT, clear=CLEAR)
-                sight = replace(sight, ink=rests)
+                sight = self._rests(image, sight, sight.board.corners)
+            if question != "check":
+                ink = [shape(p, "ink") for p in sight.ink_polygons]
+                self._was = shapely.union_all([self._was, *ink])
             return Look(time_ns, image, sight, question)
 
         return see
+
+    def _rests(self, image: npt.NDArray[np.uint8], sight: vision.Sight, corners: Array) -> vision.Sight:
+        """With the ink that is left after wiping."""
+        sure = vision.ink(image, corners, faint=FAINT, clear=CLEAR)
+        specks = vision.ink(image, corners, faint=REST_FAINT, clear=REST_CLEAR, least=REST)
+        was, mask = self._was.buffer(WAS), sure.mask.copy()
+        polygons, contrast = list(sure.polygons), list(sure.contrast)
+        places = replace(sight, ink=specks).ink_polygons
+        for pixels, place, part in zip(specks.polygons, places, specks.contrast, strict=True):
+            piece = np.zeros(mask.shape, np.uint8)
+            cv2.fillPoly(piece, [np.rint(pixels).astype(np.int32)], 1)
+            if shape(place, "ink").within(was) and not sure.mask[piece > 0].any():
+                mask |= (piece > 0) & specks.mask
+                polygons.append(pixels)
+                contrast.append(part)
+        return replace(sight, ink=vision.Ink(mask, tuple(polygons), sure.objects, np.array(contrast)))
 
 
 def _within(corners: Array, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:

@@ -147,6 +147,12 @@ class Plan:
     """(2,) where the tool was when this was planned"""
 
     @property
+    def summary(self) -> str:
+        """How many strokes, and straight pieces of them, in words."""
+        pieces = sum(len(stroke) - 1 for stroke in self.strokes)
+        return f"{_many(len(self.strokes), 'stroke')} of {_many(pieces, 'straight piece')}"
+
+    @property
     def footprint(self) -> tuple[float, float]:
         """Extent of the eraser along the board's x and y [m]."""
         w, h = self.eraser.width, self.eraser.length
@@ -423,6 +429,10 @@ def outlines(area: Any) -> Iterable[Array]:
     for part in _parts(area):
         if isinstance(part, Polygon) and part.area > _CRUMB:
             yield np.array(part.exterior.coords)[:-1]
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def shape(value: npt.ArrayLike, what: str) -> Any:

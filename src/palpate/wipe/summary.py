@@ -94,7 +94,7 @@ def report(result: JobResult, options: JobOptions, scene: BoardScene, title: str
                 "pass": str(k + 1),
                 "from": f"{p.begin_ns * 1e-9:.1f} s",
                 "took": f"{(p.end_ns - p.begin_ns) * 1e-9:.1f} s",
-                "strokes": str(sum(leg.phase == "slide" for leg in p.plan.legs)),
+                "way": p.plan.summary,
                 "ink at its beginning": f"{1e4 * p.ink:.2f} cm²",
                 "seen": f"{100.0 * p.seen:.2f} % of the surface",
             }
