@@ -399,6 +399,8 @@ def test_averages_and_thresholds_that_make_no_sense_are_refused(plain):
         vision.average([plain, plain[:-1]])
     with pytest.raises(InputError, match="0 < faint <= clear < 1"):
         vision.ink(plain, VIEW, faint=0.2, clear=0.1)
+    with pytest.raises(InputError, match="least must be at least 1 pixel"):
+        vision.ink(plain, VIEW, least=0)
 
 
 def test_ink_alone_needs_corners(plain):

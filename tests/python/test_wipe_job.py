@@ -12,7 +12,7 @@ pytest.importorskip("statemachine", reason="palpate[wipe] is not installed")
 
 from palpate import vision, wipe
 from palpate.errors import InputError, PalpateError
-from palpate.wipe import activity, boards, fast, job, mediator, motion
+from palpate.wipe import activity, boards, fast, job, mediator, motion, slow
 
 UP = np.zeros(7)
 
@@ -157,6 +157,28 @@ def test_the_robot_floats_and_brakes_without_a_fresh_command():
     assert robot.orphaned
     (now, dq), (other, _) = scene.state
     assert np.abs(now - q).max() < 0.01 and np.abs(dq).max() < 0.05 and np.abs(other).max() < 0.01
+
+
+def test_a_pale_speck_is_a_rest_where_ink_was_and_dust_elsewhere():
+    scene = made()
+    eye = slow.Perception(scene, 100_000_000, False)
+    eye.begin()
+
+    def look(why):
+        eye.question.put(why)
+        for k in range(slow.FRAMES):
+            eye.step(k * 100_000_000)
+        return eye.answer.take().sight
+
+    assert len(look("before").ink_polygons) == 2
+    scene.ink.amount[:] = 0.0
+    assert not look("after").ink_polygons
+    for x, y in ((0.20, 0.14), (0.20, 0.24)):  # on the black stroke, and where no ink was
+        j, i = round(x / scene.ink.texel), round(y / scene.ink.texel)
+        scene.ink.amount[i - 1 : i + 2, j - 1 : j + 2] = 0.07
+        scene.ink.colour[i - 1 : i + 2, j - 1 : j + 2] = 32.0
+    (rest,) = look("after").ink_polygons
+    np.testing.assert_allclose(rest.mean(0), [0.20, 0.14], atol=0.004)
 
 
 # -- jobs ----
