@@ -89,34 +89,11 @@ FEATURES = (
 )
 WEIGHTS = np.array(
     [
-        -0.161,
-        0.940,
-        -0.095,
-        0.630,
-        -0.150,
-        8.947,
-        0.707,
-        -0.579,
-        -0.488,
-        -0.247,
-        -0.750,
-        0.084,
-        0.459,
-        0.147,
-        0.456,
-        -0.171,
-        -2.580,
-        -0.686,
-        1.625,
-        0.303,
-        -0.393,
-        -0.055,
-        0.991,
-        0.013,
-        0.384,
-        -0.677,
+        -0.161, 0.940, -0.095, 0.630, -0.150, 8.947, 0.707, -0.579, -0.488,
+        -0.247, -0.750, 0.084, 0.459, 0.147, 0.456, -0.171, -2.580, -0.686,
+        1.625, 0.303, -0.393, -0.055, 0.991, 0.013, 0.384, -0.677,
     ]
-)
+)  # fmt: skip
 BIAS = -0.151
 
 
@@ -329,8 +306,7 @@ def _features(
     beyond = np.abs(average(at - 20, at - 10) - average(at + 4, at + 10))
     deeper = np.maximum.accumulate(best[::-1])[::-1]
     inside = np.where(at + 4 < count, deeper[np.minimum(at + 4, count - 1)], 0.0)
-    x = np.empty((found, len(FEATURES)))
-    width, wider, sharp, close, busy = (np.zeros(found) for _ in range(5))
+    width, sharp = np.zeros(found), np.zeros(found)
     for i in range(found):
         slope = mean[shear[i], :count] * np.sign(mean[shear[i], at[i]])
         width[i] = _width(slope, int(at[i]))
@@ -377,9 +353,7 @@ def _features(
         np.log((beyond + 0.3) / size),
         np.minimum(((distance > 8.0) & (strength[None] > 0.5 * strength[:, None])).sum(1), 3.0),
     )
-    for i, column in enumerate(columns):
-        x[:, i] = column
-    return x
+    return np.column_stack(columns)
 
 
 def _width(slope: Float, row: int) -> float:

@@ -256,13 +256,15 @@ class Mediator(Activity):
         self._fault: Slot[str] = Slot()
         self._cause: Cause = ""
         self._since = self._well = 0
-        self._asked = False
+        self._now = 0
+        self._asked = self._parked = False
         self._paths: deque[tuple[int, Path]] = deque()
         self._law: tuple[int, Law] | None = None
         self._tries = self._grips = self._again = self._doubts = self._brought = 0
         self._unreachable = self._refused = ""
         self._stopping = False
         self._choice: Choice | None = None
+        self._route_now = Route()
         self._reference: Look
         self._hand: Array | None = None
         self._loose = True  # as far as is known the board stays where it is by itself
@@ -382,9 +384,6 @@ class Mediator(Activity):
         else:
             self._go("look")
             self._tries = 0
-
-    _parked = False
-    _now = 0
 
     def _looking(self) -> None:
         look = self._look("before" if self.memory.first is None else "after")
@@ -580,8 +579,6 @@ class Mediator(Activity):
         self._route_now = route
         self._go("move")
         self._paths.extend((0, p) for p in route.paths)
-
-    _route_now = Route()
 
     def _bringing(self) -> None:
         """The other arm takes the board to where the eraser reaches; then it is looked at again."""
