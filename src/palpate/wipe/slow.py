@@ -46,6 +46,8 @@ REST_FAINT, REST_CLEAR, REST = 0.010, 0.015, 6
 """the same where ink was, and pixels of a rest at least: elsewhere so small and pale a speck is the surface's own"""
 WAS = 0.004
 """where ink was, and so far beside it [m]"""
+DUSTY = 2.0
+"""specks where ink was are rests if there are so many times as many as on as much of the surface beside it"""
 FREE = 0.003
 """a hand about to take the board keeps so far from everything [m]"""
 MARGINS = (0.4, 0.05)
@@ -153,16 +155,25 @@ class Perception(Slow[str, Look]):
         sure = vision.ink(image, corners, faint=FAINT, clear=CLEAR)
         specks = vision.ink(image, corners, faint=REST_FAINT, clear=REST_CLEAR, least=REST)
         was, mask = self._was.buffer(WAS), sure.mask.copy()
-        polygons, contrast = list(sure.polygons), list(sure.contrast)
-        places = replace(sight, ink=specks).ink_polygons
-        for pixels, place, part in zip(specks.polygons, places, specks.contrast, strict=True):
-            piece = np.zeros(mask.shape, np.uint8)
-            cv2.fillPoly(piece, [np.rint(pixels).astype(np.int32)], 1)
-            if shape(place, "ink").within(was) and not sure.mask[piece > 0].any():
-                mask |= (piece > 0) & specks.mask
-                polygons.append(pixels)
-                contrast.append(part)
-        return replace(sight, ink=vision.Ink(mask, tuple(polygons), sure.objects, np.array(contrast)))
+        rests, elsewhere = [], 0
+        for k, place in enumerate(replace(sight, ink=specks).ink_polygons):
+            drawn = np.zeros(mask.shape, np.uint8)
+            cv2.fillPoly(drawn, [np.rint(specks.polygons[k]).astype(np.int32)], 1)
+            piece = drawn > 0
+            if sure.mask[piece].any():
+                continue
+            if shape(place, "ink").within(was):
+                rests.append((k, piece & specks.mask))
+            else:
+                elsewhere += 1
+        width, height = self._scene.ink.size
+        if len(rests) <= DUSTY * elsewhere * was.area / max(width * height - was.area, was.area):
+            rests = []  # as many as the surface has by itself
+        for _, piece in rests:
+            mask |= piece
+        polygons = *sure.polygons, *(specks.polygons[k] for k, _ in rests)
+        contrast = *sure.contrast, *(specks.contrast[k] for k, _ in rests)
+        return replace(sight, ink=vision.Ink(mask, polygons, sure.objects, np.array(contrast)))
 
 
 def _within(corners: Array, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
