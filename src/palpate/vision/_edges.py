@@ -54,6 +54,10 @@ BURNT = 250.0
 """brightness from which nothing can be told apart [grey levels]"""
 BLIND = 12.0
 """a burnt stretch this near to an edge may hide the border [pixels]"""
+NEARLY = 240.0
+"""brightness of a surface that burns where there is but a little more light [grey levels]"""
+CRISP, DROP = 3.0, 40.0
+"""a border is seen beside what is burnt if it is darker by the second so near to it [pixels], [grey levels]"""
 BOTH_WAYS, BLIND_ROWS = 0.6, 120
 """and is followed so far outward and inward, relative to the board, in so many rows"""
 BOW = 0.4
@@ -391,12 +395,16 @@ def _side(grey: Image, strips: _Strips, k: int) -> _Side:
 
 
 def _blind(grey: Image, strips: _Strips, k: int, place: float) -> float:
-    """How far the picture is burnt across side k from an edge at `place` [pixels]; 0 if the whole surface is."""
+    """How far the picture is burnt across side k from an edge at `place` [pixels]; 0 if a frame beside it is seen."""
     level = strips.level[k]
     row = (place - strips.first[k]) / PITCH + 1.0
-    near = level[max(round(row - BLIND / PITCH), 0) : round(row + BLIND / PITCH) + 1]
-    deepest = strips.level[np.arange(4), strips.rows]
-    if near.max() < BURNT or deepest.min() >= BURNT:
+    beyond, reach = max(round(row - CRISP / PITCH), 0), round(BLIND / PITCH)
+    near = level[max(round(row) - reach, 0) : round(row) + reach + 1]
+    outside = level[max(round(row) - reach, 0) : beyond + 1]
+    # a surface that is nearly burnt all over ends where a frame that is not begins
+    everywhere = np.count_nonzero(strips.level[np.arange(4), strips.rows] >= NEARLY) > 1
+    crisp = level[beyond] < BURNT - DROP and outside.max() < BURNT
+    if near.max() < BURNT or (everywhere and crisp):
         return 0.0
     size = (STRETCHES * EACH // 3, BLIND_ROWS)
     wide = _strip(grey, strips.H[k], (ENDS, 1.0 - ENDS), (-BOTH_WAYS, BOTH_WAYS), size)

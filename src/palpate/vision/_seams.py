@@ -97,12 +97,12 @@ def bands(grey: Image, corners: Array, first: int) -> list[Seam]:
     along = (np.arange(STRETCHES) + 0.5) / STRETCHES - 0.5
     at = np.arange(ACROSS - 2) + np.rint(LEANS[:, None] * along)[..., None].astype(np.int64)
     leaning = step[np.arange(STRETCHES)[:, None], np.clip(at, 0, ACROSS - 3)]
-    mean = np.median(leaning, 1)
+    mean = np.sort(leaning, 1)[:, STRETCHES // 2]  # medians; numpy's own take longer
     agree = (leaning * np.sign(mean)[:, None] > AGREE * np.abs(mean)[:, None]).mean(1)
     lean = (np.abs(mean) * agree).argmax(0)
     mean, agree = (x[lean, np.arange(ACROSS - 2)] for x in (mean, agree))
     edges = np.sort(np.concatenate([_peaks(mean, agree), _peaks(-mean, agree)]))
-    level = np.median(profile, 0)
+    level = np.sort(profile, 0)[STRETCHES // 2]
     ends = np.stack([_rows(grey, H, v, v, 1)[0] for v in (SHORT, 1.0 - SHORT)])
     found = []
     for k, x in enumerate(edges):
