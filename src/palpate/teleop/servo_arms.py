@@ -12,16 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._core import HeldLoad, MomentumObserver, Status
 from ..arm import Arm, Array, Sensing
 from ..drivers.driver import Driver
 from ..drivers.mujoco import MujocoDriver
 from ..errors import InputError
 from ..logs import Sample
-from ..pipeline import Pipeline
 from ..simulate import Plant, SensorModel
 from .masters import Hand
-from .motor_force import LowPass
+from .servo_force import CountedMotion, ServoForce
 from .slaves import RATE, InScene, Seen
 
 if TYPE_CHECKING:
@@ -37,18 +35,24 @@ LOAD_FRICTION = 0.2116
 """part of the load its gears lose (Rhoban/bam, feetech_sts3215_7_4V, m3) [1]"""
 BANDWIDTH = 50.0
 """of the follower's position control [rad/s]: encoders of 12 bit allow no more"""
-STIFFENING = 6.0
+STIFFENING = 2.0
 """bandwidth with which the external torque is taken off [rad/s]"""
+FORWARD = 30.0
+"""low-pass of the reference's acceleration [rad/s]"""
 BUS_RATE = 250.0
 """readings and commands per second, what a bus of six servos at 1 Mbit/s allows [Hz]"""
-OBSERVER = 30.0
-"""bandwidth of the follower's momentum observer [rad/s]"""
+OBSERVER = 60.0
+"""bandwidth of the corrections by the encoders, both arms' [rad/s]: with steps of 12 bit more is noise"""
+DITHER, DITHER_PERIOD = 2.5, 8
+"""amplitude of the torque that shakes a follower in contact, part of what its friction can be, and its period in
+commands [1]: well above one, so that friction turns over within each period; 31 Hz, where a joint hardly moves"""
+NOISE, BEHIND = 0.02, 0.08
+"""deviation of the external torque where nothing touches [N m], and what is added of all joints' torque of a touch [1]:
+it changes faster than the observer"""
 CERTAIN, GONE = 64.0, 16.0
 """a touch is certain where the sum of the joints' (torque/std)^2 is above the one, until it is below the other [1]"""
 TURNING = 0.05
-"""speed from which on the sign of friction is known: the encoder has turned a few counts lately [rad/s]"""
-VELOCITY = 200.0
-"""low-pass of positions before velocities are taken [rad/s]"""
+"""speed of the reference from which on friction is made up for whole [rad/s]"""
 
 
 def with_servos(arm: Arm) -> Arm:
@@ -78,17 +82,18 @@ class LeaderArm:
         driver: of the arm; connected and enabled here.
         arm: its model.
         force_limit: (n,) torque that is added at most, or one number [N m].
+        count: of its encoders [rad].
     """
 
-    def __init__(self, driver: Driver, arm: Arm, *, force_limit: float | Array = 2.0) -> None:
+    def __init__(
+        self, driver: Driver, arm: Arm, *, force_limit: float | Array = 2.0, count: float = COUNT
+    ) -> None:
         self.driver, self.arm = driver, arm
         self.force_limit: Array = np.broadcast_to(np.asarray(force_limit, dtype=np.float64), (arm.n,))
         self._period = driver.period_ns * 1e-9
-        self._position = LowPass(VELOCITY, self._period)
+        self._motion = CountedMotion(arm.n, count, OBSERVER, self._period)
         driver.connect()
         driver.enable()
-        self._dq = np.zeros(arm.n)
-        self._smooth: Array | None = None
         self._due = 0.0
         self._take(driver.read())
 
@@ -96,12 +101,9 @@ class LeaderArm:
         if sample is None:
             return
         q = np.asarray(sample.position)
-        smooth = self._position(q)
-        before = smooth if self._smooth is None else self._smooth
-        self._dq = (
-            (smooth - before) / self._period if sample.velocity is None else np.asarray(sample.velocity)
-        )
-        self._q, self._smooth = q.copy(), smooth
+        moves = self._motion(q)
+        self._dq = moves if sample.velocity is None else np.asarray(sample.velocity)
+        self._q = q.copy()
 
     def read(self) -> tuple[Array, Array]:
         """(n,) joint positions [rad], (n,) velocities [rad/s]."""
@@ -166,10 +168,13 @@ class SimulatedLeader(LeaderArm):
 class ServoSlave(InScene):
     """The follower: joint references in, external torque of the joints out, from positions and currents of its servos.
 
-    Computed torque with feed-forward friction. The external torque is that of the momentum observer; its deviation
-    has in it what friction may hide: all of Coulomb and load friction at rest, less the faster a joint turns::
+    Computed torque with feed-forward friction; the external torque is that of :class:`ServoForce`. While a touch is
+    certain the motors shake the joints, each against the next, by less than a step of their encoders, or stiction
+    would hide what presses::
 
-        std^2 = std_observer^2 + ((F_c + mu |tau|)/sqrt(3))^2 (1 - tanh^2(dq/v))
+        std^2 = s_0^2 + s_1^2 |tau_ext|^2 + (p F)^2/3,    F = F_c + mu |tau|
+
+    p: part of the time in which the joint stuck, and its friction was anything within +-F.
 
     Args:
         arm: with its tool.
@@ -183,6 +188,9 @@ class ServoSlave(InScene):
             raise InputError(f"q: expected {arm.n} angles, got {np.shape(q)}")
         known = with_servos(arm)
         build = None if scene is None else scene.build
+        self._force = ServoForce(
+            known, load_friction=LOAD_FRICTION, count=COUNT, bandwidth=OBSERVER, period=1.0 / BUS_RATE
+        )
         plant = Plant(
             with_load_friction(known),
             contacts=build is not None,
@@ -191,7 +199,10 @@ class ServoSlave(InScene):
             integrator="discrete",
         )
         self._coulomb = np.array([j.friction.coulomb for j in known.joints])
+        self._viscous = np.array([j.friction.viscous for j in known.joints])
         self._certain = False
+        self._speed, self._shakes = np.zeros(known.n), np.where(np.arange(known.n) % 2, -1.0, 1.0)
+        self._commands = 0
         driver = MujocoDriver(plant, sensor=SensorModel(known, rate=BUS_RATE, seed=seed), q=q)
         self._every, self._tick = round(RATE / BUS_RATE), 0
         super().__init__(driver, scene, model=known)
@@ -205,13 +216,13 @@ class ServoSlave(InScene):
 
     def hold(self, mass: float) -> None:
         """From now on this mass in the hand is known [kg]: its weight and inertia are not felt."""
-        self._pipeline = Pipeline(
-            self.model,
-            observer=MomentumObserver(bandwidth=OBSERVER),
-            payload=None,
-            wrench=None,
-            load=HeldLoad(mass=mass),
-        )
+        self._force.hold(mass)
+
+    def _take(self, sample: Sample) -> None:
+        position, effort = np.asarray(sample.position), np.asarray(sample.effort)
+        self._good = bool(np.isfinite(position).all() and np.isfinite(effort).all())
+        if self._good:
+            self._force.step(position, effort)
 
     def read(self) -> Seen:
         """What is known; the bus tells something new every few periods."""
@@ -219,24 +230,17 @@ class ServoSlave(InScene):
         return super().read() if self._tick % self._every == 1 else self.seen
 
     def _see(self) -> Seen:
-        touch, q = self._touch, np.asarray(self._sample.position)
-        external = touch.external
-        dq = np.asarray(touch.dq)
-        good = external.status == Status.ok
-        known = np.tanh(dq / TURNING) ** 2
-        load = np.abs(np.asarray(self._sample.effort))
-        hidden = (self._coulomb + LOAD_FRICTION * load) / math.sqrt(3.0)
-        # gears that turn lose a part of their load, against the motion
-        lost = LOAD_FRICTION * load * np.tanh(dq / TURNING)
-        torque = np.asarray(external.torque) + lost if good else np.zeros(self.axes)
-        std = np.sqrt(np.square(external.std) + np.square(hidden) * (1.0 - known))
-        surprise = float(np.square(torque / std).sum())
-        self._certain = good and surprise > (GONE if self._certain else CERTAIN)
-        std = std if good else np.full(self.axes, np.inf)
+        force, q = self._force, np.asarray(self._sample.position)
+        late = BEHIND**2 * float(np.square(force.torque).sum())
+        std = np.sqrt(NOISE**2 + late + np.square(force.stuck * force.band) / 3.0)
+        surprise = float(np.square(force.torque / std).sum())
+        self._certain = self._good and surprise > (GONE if self._certain else CERTAIN)
+        std = std if self._good else np.full(self.axes, np.inf)
         # that there is a touch is certain then, and the question is its size
         shown = 0.25 * std if self._certain else std
-        usable = good and self._lost == 0
-        return Seen(self._sample.time_ns, q, dq, q, dq, torque, std, self._reason, usable, shown)
+        usable = self._good and self._lost == 0
+        dq = force.dq.copy()
+        return Seen(self._sample.time_ns, q, dq, q, dq, force.torque.copy(), std, self._reason, usable, shown)
 
     def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:
         """Send the torque that takes the joints to `x_ref` (n,) [rad] at `v_ref` (n,) [rad/s].
@@ -247,18 +251,25 @@ class ServoSlave(InScene):
         if self._tick % self._every != 1:
             return np.zeros(self.axes)
         h, seen = self._period, self.seen
-        ddq_ref = np.clip((v_ref - self._dq_ref) / h, -40.0, 40.0)
+        ddq_ref = FORWARD * (v_ref - self._speed)
+        self._speed = self._speed - math.expm1(-FORWARD * h) * (v_ref - self._speed)
         self._q_ref, self._dq_ref = np.clip(x_ref, self._low, self._high), v_ref
         self._reason = (
             "a joint of the slave at its limit: the master points out of its reach"
             if np.any(self._q_ref != x_ref)
             else ""
         )
-        a = ddq_ref + BANDWIDTH**2 * (self._q_ref - seen.q) + 2.0 * BANDWIDTH * (v_ref - seen.dq)
-        torque = self.model.inverse_dynamics(seen.q, v_ref, a)
-        torque = torque + (self._coulomb + LOAD_FRICTION * np.abs(torque)) * np.tanh(v_ref / TURNING)
+        a = ddq_ref + BANDWIDTH**2 * (self._q_ref - self._force.q) + 2.0 * BANDWIDTH * (v_ref - seen.dq)
+        torque = self.model.inverse_dynamics(self._force.q, v_ref, a)
         self._taken_off = self._taken_off - math.expm1(-STIFFENING * h) * (seen.force - self._taken_off)
         torque = torque - self._taken_off
+        dry = self._coulomb + LOAD_FRICTION * np.abs(torque)
+        torque = torque + dry * np.tanh(v_ref / TURNING) + self._viscous * v_ref
+        if self._certain:
+            self._commands += 1
+            spare = np.maximum(0.0, self._effort - np.abs(torque))
+            swing = np.minimum(DITHER * self._force.band, spare) * self._shakes
+            torque = torque + swing * math.sin(2.0 * math.pi * self._commands / DITHER_PERIOD)
         if push is not None:
             torque = torque + push
         if self.driver.state != "enabled":
