@@ -32,6 +32,13 @@ BEFORE = 0.012
 """so long a glitch spoils currents before anything shows it [s]"""
 CATCH_UP = 2.0 / KINEMATIC
 """how long the currents' low-pass needs after a glitch [s]"""
+PER_WAY, PER_TIME = 158.0, 2.0
+"""how much a touch may change: by 5 N over a millimetre of the tool's way, as against 5 kN/m [N/sqrt(m)]; by itself
+[N/sqrt(s)]"""
+READING = 0.5
+"""deviation of a motor torque's reading, friction aside [N m]"""
+WARM_UP = 0.1
+"""so long nothing is taken for a touch: low-passes settle [s]"""
 DIRECT_SHARE, CURRENT_RATE = 0.05, 20.0
 """of :class:`palpate.phase.PhaseCurrents`: 60 N m of friction turned over in 20 ms are 20 A/s"""
 
@@ -216,8 +223,56 @@ class MotorTouch(NamedTuple):
     """every current is known"""
 
 
+class _Split:
+    """What of the motors' residual torque is a touch, and what an error of the friction model.
+
+    A Kalman filter of two states for each motor: the touch t changes as the tool moves, for then it presses more or
+    less, and slowly by itself; the error e of the friction is renewed as the motor turns, by its presliding, and knows
+    its deviation. An arm that stands keeps both apart as they were, however badly its friction is known there::
+
+        y = t + e + noise,    var dt = l^2 (c_s^2 |v| + c_t^2) dt,    e <- a e,    var de = (1 - a^2) S(z),
+        a = exp(-|w| dt/x_0),   S = sliding^2 + turning^2 (1 - z^2),   l: lever of the tool at the motor [m]
+    """
+
+    def __init__(self, model: MotorModel) -> None:
+        n = len(model.gain)
+        self._model = model
+        self.touch, self._error = np.zeros(n), np.zeros(n)
+        # variance of the touch, of the error, and their covariance
+        self.variance, self._own = np.zeros(n), model.sliding_std**2 + model.turning_std**2
+        self._both = np.zeros(n)
+
+    def step(
+        self, residual: Array, z: Array, turned: Array, lever: Array, way: float, h: float, seen: BoolArray
+    ) -> None:
+        """A period of `h` [s] later.
+
+        Args:
+            residual: (n,) [N m].
+            z: (n,) remembered sign of friction [1].
+            turned: (n,) way of the motors in this period [rad].
+            lever: (n,) [m].
+            way: of the tool in this period [m].
+            seen: (n,) motors whose residual counts.
+        """
+        m = self._model
+        a = np.exp(-np.abs(turned) / m.presliding)
+        friction = m.sliding_std**2 + m.turning_std**2 * (1.0 - z**2)
+        touch = self.variance + lever**2 * (PER_WAY**2 * way + PER_TIME**2 * h)
+        both, own = a * self._both, a * a * self._own + (1.0 - a * a) * friction
+        self._error = a * self._error
+        innovation = residual - self.touch - self._error
+        total = touch + 2.0 * both + own + READING**2
+        gain, other = (np.where(seen, part / total, 0.0) for part in (touch + both, both + own))
+        self.touch, self._error = self.touch + gain * innovation, self._error + other * innovation
+        self.variance = touch - gain * (touch + both)
+        self._both = both - gain * (both + own)
+        self._own = own - other * (both + own)
+
+
 class MotorForce:
-    """The external torque of a geared arm and the force on its tool, live; the estimator of the sensorless-force study.
+    """The external torque of a geared arm and the force on its tool, live; the estimator of the sensorless-force study
+    with a memory: what touches an arm that stands is what touched it when it came to rest.
 
     Args:
         arm: kinematics and gravity.
@@ -256,6 +311,7 @@ class MotorForce:
         self._dq, self._v = np.zeros(n), np.zeros(3)
         self._z, self._bump = np.zeros(n), np.zeros(n)
         self._residual = np.zeros(n)
+        self._split, self._steps = _Split(self.model), 0
         self._since, self._hidden = np.full(n, math.inf), np.zeros(n)
         self._way, self._turned, self._farthest = np.zeros(n), np.full(n, math.inf), np.full(n, math.nan)
         self._past = deque([np.zeros(n)], maxlen=max(1, round(BEFORE / self._h)))
@@ -303,11 +359,18 @@ class MotorForce:
         external = self._smooth(self._residual)
         self._past.append(external)
 
-        tau = external @ m.B
-        sliding = m.sliding_std**2 + (m.gain_std * external) ** 2
-        seen = sliding + m.turning_std**2 * (1.0 - self._z**2)
+        self._steps += 1
+        if self._steps * h > WARM_UP:
+            J = self.arm.jacobian(q, self.arm.grasp)[:3]
+            lever = np.linalg.norm(J @ self._inverse, axis=0)
+            way = float(np.linalg.norm(J @ dq)) * h
+            self._split.step(external, self._z, m.B @ dq * h, lever, way, h, self._hidden == 0.0)
+        touch = self._split.touch
+        tau = touch @ m.B
+        gain = (m.gain_std * touch) ** 2
+        sliding, seen = m.sliding_std**2 + gain, self._split.variance + gain
         covariance = np.einsum(
-            "ki,rk,kj->rij", m.B, [seen + (PUSH_RATE * self._hidden) ** 2, seen, sliding], m.B
+            "ki,rk,kj->rij", m.B, [seen + (PUSH_RATE * self._hidden) ** 2, seen, np.minimum(sliding, seen)], m.B
         )
         three = np.ones((3, 1))
         solved = solve_wrench(self.arm.core, self._wrench, three * q, three * tau, covariance)
