@@ -61,7 +61,7 @@ class IndustrialSlave(InScene):
         self._integral = np.zeros(arm.n)
         sensors = PhaseSensors(arm, CurrentSensors.drawn(np.random.default_rng(SENSORS)), seed=seed)
         plant = GearedPlant(arm, drives, q, contacts=build is not None, scene=build)
-        self._certain = False
+        self._certain = np.zeros(3, dtype=bool)
         self._estimator = MotorForce(arm, identified(arm.name), period=sensors.period_ns * 1e-9)
         driver = MujocoDriver(plant, sensor=sensors, q=q)
         super().__init__(driver, scene, model=arm)
@@ -75,9 +75,9 @@ class IndustrialSlave(InScene):
     def _take(self, sample: Sample) -> None:
         felt = self._felt = self._estimator.step(sample)
         size = np.abs(felt.force)
-        self._certain = bool(
-            np.any(size > CERTAIN * felt.seen_std)
-            or (self._certain and np.any(size > 0.5 * CERTAIN * felt.sliding_std))
+        # each axis for itself: that it presses ahead says nothing of what friction hides across
+        self._certain = (size > CERTAIN * felt.seen_std) | (
+            self._certain & (size > 0.5 * CERTAIN * felt.sliding_std)
         )
 
     def _see(self) -> Seen:
@@ -86,7 +86,7 @@ class IndustrialSlave(InScene):
         # in the estimator, and a tool that presses has none
         R, tip, J = self._pose(np.asarray(self._sample.position))
         unknown = np.full(3, np.inf)
-        seen_std = felt.sliding_std if self._certain else felt.seen_std
+        seen_std = np.where(self._certain, felt.sliding_std, felt.seen_std)
         return Seen(
             self._sample.time_ns,
             np.asarray(self._sample.position),
