@@ -24,14 +24,15 @@ from palpate.simulate.irb2400 import GLITCH, B, CurrentSensors, PhaseSensors, tr
 from palpate.studies import _irb2400
 from palpate.studies._geared_arm import Run, simulate
 from palpate.studies._irb2400_force import late
-from palpate.studies._teleop_slaves import circle, contact
-from palpate.teleop import Hand
+from palpate.studies._teleop_hands import free, pressing
+from palpate.studies._teleop_slaves import contact, held_torque, led
 from palpate.teleop.figures import transparency
 from palpate.teleop.industrial import SENSORS
-from palpate.teleop.motor_force import LowPass, MotorForce, MotorModel, identified
+from palpate.teleop.motor_force import LowPass, MotorForce, MotorModel, _Split, identified
 from palpate.teleop.scenes import slave_arm
 from palpate.teleop.servo_arms import LeaderArm, joint_path
-from palpate.teleop.setups import JOINT_HAND, build
+from palpate.teleop.servo_force import ServoForce
+from palpate.teleop.setups import build
 
 ABB = "abb_irb2400_16"
 POSE = np.array([0.0, 0.3, 0.1, 0.0, 0.9, 0.0])
@@ -161,7 +162,8 @@ def test_the_stored_model_is_what_identification_finds() -> None:
 
 
 def test_the_abb_follows_and_nothing_false_is_felt() -> None:
-    run = build(None, arm=ABB, hand=Hand(wish=circle(0.1))).run(seconds=4.0)
+    draw = free(slave_arm(ABB), 1, 0.1, 4.0)
+    run = build(None, arm=ABB, hand=draw.hand, seed=draw.seed).run(seconds=draw.seconds)
     t = transparency(run, force_scale=slave_arm(ABB).force_scale)
     assert t.tracking < 2e-3 and t.speed > 0.4
     assert np.abs(run.felt).max() / slave_arm(ABB).force_scale < 1.57
@@ -188,7 +190,10 @@ def test_the_abb_weighs_while_it_moves() -> None:
 
 def test_the_path_of_the_joints_takes_the_tip_along_the_path_of_the_hand() -> None:
     chosen = slave_arm("so101")
-    way = circle(0.05)
+
+    def way(time: float) -> np.ndarray:
+        return 0.05 * np.array([np.sin(time), 0.0, np.cos(time) - 1.0])
+
     wish = joint_path(chosen.arm, chosen.q, way, 4.0)
 
     def tip(q: np.ndarray) -> np.ndarray:
@@ -201,15 +206,56 @@ def test_the_path_of_the_joints_takes_the_tip_along_the_path_of_the_hand() -> No
 
 def test_the_so101_follows_its_twin_and_the_hand_feels_a_touch() -> None:
     chosen = slave_arm("so101")
-    wish = joint_path(chosen.arm, chosen.q, circle(0.06), 3.5)
-    run = build(None, arm="so101", hand=Hand(wish=wish, **JOINT_HAND)).run(seconds=3.5)
-    assert run.device.shape == (3500, 5)
-    assert np.ptp(run.tip, axis=0).max() > 0.1
-    assert np.abs(run.tip - run.wanted).max() < 0.02 and np.abs(run.felt).max() < 0.1
-    pressed = build("wall", arm="so101", stiffness=500.0, press=0.03).run(seconds=5.0)
-    late_on = slice(4200, None)
-    assert np.linalg.norm(pressed.true[late_on], axis=1).min() > 0.5
-    assert np.mean((pressed.felt * pressed.true).sum(axis=1)[late_on] > 0.0) > 0.9
+    moved = led(free(chosen, 1, 0.06, 3.5))
+    assert moved.tracking < 2e-3 and moved.free_force < 0.1
+    draw = pressing(chosen, 1, 500.0, 0.03)
+    pressed = build("wall", arm="so101", stiffness=draw.stiffness, hand=draw.hand, seed=1).run(seconds=5.5)
+    felt, estimated, true = held_torque(pressed)
+    assert true > 0.5 and felt < 0.1 and estimated < 0.1
+
+
+def test_a_servo_at_rest_keeps_its_touch_and_one_that_turns_back_and_forth_tells_it() -> None:
+    """One joint about the vertical, its friction a quarter of the touch."""
+    arm = robots.load("so101")
+    count, h, touch = 1.5e-3, 4e-3, 0.5
+    force = ServoForce(arm, load_friction=0.2, count=count, bandwidth=60.0, period=h)
+    q, gravity = np.zeros(arm.n), arm.gravity_torque(np.zeros(arm.n))
+    # at rest whatever the motor bears within friction's band leaves the estimate as it is
+    for k in range(200):
+        force.step(q, gravity + 0.05 * np.sin(0.1 * k))
+    np.testing.assert_allclose(force.torque, 0.0, atol=1e-9)
+    assert force.stuck.min() > 0.99
+    # a joint that stands although its motor pushes harder than friction is pushed back
+    for _ in range(500):
+        push = gravity.copy()
+        push[0] -= touch
+        force.step(q, push)
+    band = force.band[0]
+    assert touch - 1.2 * band < force.torque[0] < touch
+
+
+def test_a_resting_motor_changes_its_friction_and_not_the_touch() -> None:
+    """The residual that comes with a motor's way at rest is friction's; what comes without any is a touch."""
+    model = identified()
+    z, lever, seen = np.full(6, 0.9), np.ones(6), np.ones(6, dtype=bool)
+    split = _Split(model)
+    for k in range(400):
+        # it comes to rest from sliding: friction turns over, and the residual with it
+        split.step(
+            np.full(6, 2.0 * k / 400),
+            z * (1.0 - k / 400),
+            0.5 * model.presliding / 400,
+            lever,
+            0.0,
+            1e-3,
+            seen,
+        )
+    assert np.abs(split.touch)[[0, 1, 2, 4]].max() < 1.0
+    split = _Split(model)
+    for k in range(400):
+        split.step(np.full(6, 2.0 * k / 400), np.ones(6), np.zeros(6), lever, 0.0, 1e-3, seen)
+    assert np.abs(split.touch).min() > 1.0
+    assert np.all(split.variance > 0.0)
 
 
 def test_a_real_leader_arm_is_read_and_pushes_back_over_its_bus() -> None:

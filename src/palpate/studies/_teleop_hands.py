@@ -1,4 +1,4 @@
-"""Hands of the teleoperation study by which figures are judged: each draws its grip, its way and the wall it presses."""
+"""Hands by which the teleoperation study judges: each draws its grip, its way and the wall it presses."""
 
 from __future__ import annotations
 
@@ -44,9 +44,7 @@ class Draw:
     seconds: float
 
 
-def _held(
-    rng: np.random.Generator, chosen: SlaveArm, path: Callable[[float], Array], seconds: float
-) -> Hand:
+def _held(rng: np.random.Generator, chosen: SlaveArm, path: Callable[[float], Array], seconds: float) -> Hand:
     """A hand of any grip that goes along a path of the slave's tool, from its start (3,) [m]."""
     mass, stiffness, damping, tremor = rng.uniform(0.75, 1.25, 4)
     rate = float(rng.uniform(8.0, 12.0))

@@ -15,7 +15,8 @@ from ..teleop.scenes import smooth
 from ..teleop.setups import build
 from . import Row
 from ._rows import at_most, told
-from ._teleop_slaves import ABB, IIWA, circle
+from ._teleop_hands import circle
+from ._teleop_slaves import ABB, IIWA
 
 JOBS, QUICK_JOBS = 4, 2
 _WOBBLE = np.array([0.3, 0.25, 0.4]), np.array([2.0, 1.7, 2.4])

@@ -32,9 +32,13 @@ BEFORE = 0.012
 """so long a glitch spoils currents before anything shows it [s]"""
 CATCH_UP = 2.0 / KINEMATIC
 """how long the currents' low-pass needs after a glitch [s]"""
-PER_WAY, PER_TIME = 158.0, 2.0
+PER_WAY, PER_TIME = 158.0, 10.0
 """how much a touch may change: by 5 N over a millimetre of the tool's way, as against 5 kN/m [N/sqrt(m)]; by itself
 [N/sqrt(s)]"""
+MOMENT = 0.2
+"""lever of a force's moment about the grasp point [m]"""
+SUDDEN = 3.0
+"""a residual that is off by so many of its deviations is a push that began [1]"""
 READING = 0.5
 """deviation of a motor torque's reading, friction aside [N m]"""
 WARM_UP = 0.1
@@ -263,6 +267,9 @@ class _Split:
         self._error = a * self._error
         innovation = residual - self.touch - self._error
         total = touch + 2.0 * both + own + READING**2
+        # more than friction can be: something pushes
+        sudden = np.where(seen & (innovation**2 > SUDDEN**2 * total), innovation**2, 0.0)
+        touch, total = touch + sudden, total + sudden
         gain, other = (np.where(seen, part / total, 0.0) for part in (touch + both, both + own))
         self.touch, self._error = self.touch + gain * innovation, self._error + other * innovation
         self.variance = touch - gain * (touch + both)
@@ -362,7 +369,7 @@ class MotorForce:
         self._steps += 1
         if self._steps * h > WARM_UP:
             J = self.arm.jacobian(q, self.arm.grasp)[:3]
-            lever = np.linalg.norm(J @ self._inverse, axis=0)
+            lever = np.hypot(np.linalg.norm(J @ self._inverse, axis=0), MOMENT)
             way = float(np.linalg.norm(J @ dq)) * h
             self._split.step(external, self._z, m.B @ dq * h, lever, way, h, self._hidden == 0.0)
         touch = self._split.touch
@@ -370,7 +377,10 @@ class MotorForce:
         gain = (m.gain_std * touch) ** 2
         sliding, seen = m.sliding_std**2 + gain, self._split.variance + gain
         covariance = np.einsum(
-            "ki,rk,kj->rij", m.B, [seen + (PUSH_RATE * self._hidden) ** 2, seen, np.minimum(sliding, seen)], m.B
+            "ki,rk,kj->rij",
+            m.B,
+            [seen + (PUSH_RATE * self._hidden) ** 2, seen, np.minimum(sliding, seen)],
+            m.B,
         )
         three = np.ones((3, 1))
         solved = solve_wrench(self.arm.core, self._wrench, three * q, three * tau, covariance)

@@ -162,6 +162,7 @@ class SimulatedLeader(LeaderArm):
         rotors = tuple(j.replace(rotor_inertia=j.rotor_inertia + hand.mass) for j in known.joints)
         plant = HeldPlant(known.replace(joints=rotors), hand)
         sensor = SensorModel(known, rate=BUS_RATE, seed=seed)
+        self.plant = plant
         super().__init__(MujocoDriver(plant, sensor=sensor, q=q), known)
 
 

@@ -1,4 +1,4 @@
-"""What touches an arm of hobby servos, from coarse encoders and motor currents alone: an observer whose model sticks."""
+"""What touches an arm of hobby servos, from coarse encoders and motor currents: an observer whose model sticks."""
 
 from __future__ import annotations
 
