@@ -199,3 +199,22 @@ def test_the_command_turns_a_valve_and_records_it(tmp_path: Path, capsys: pytest
     log = Log.open(tmp_path / "teleop.mcap")
     for name, unit in (("master_turn", "rad"), ("slave_turn", "rad"), ("true_torque", "N m")):
         assert log.signals[name].value.shape == (2800, 3) and log.signals[name].unit == unit
+
+
+def test_a_singular_pose_is_held_told_felt_and_left_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hand that stretches the arm out and beyond: its joints stay slow, the reason is one line, the hand feels it."""
+    from palpate.teleop import setups
+
+    monkeypatch.setattr(setups, "REACH", 1.0)
+    way = scenes.through([(1.5, (0.0,) * 3), (3.0, (0.4, 0.0, 0.0)), (3.6, (0.4, 0.0, 0.0)), (5.0, (0.0,) * 3)])
+    setup = build(None, hand=Hand(wish=way))
+    slave = setup.slave
+    run = setup.run(seconds=7.5)
+    least = [np.linalg.svd(slave._pose(q)[2])[1][-1] for q in run.q[::50]]
+    assert min(least) < 0.02, "the pose is singular"
+    fastest = np.array([j.limits.velocity for j in slave.model.joints])
+    assert np.all(np.abs(np.diff(run.q, axis=0)) / H < 1.02 * fastest)
+    told = [text for _, text in run.reasons if "singular" in text]
+    assert len(told) == 1 and "gives up" in told[0]
+    assert run.felt[:, 0].min() == pytest.approx(-8.5)  # as hard as the device can
+    assert np.linalg.norm(run.tip[-1] - run.wanted[-1]) < 3e-3 and not run.holding

@@ -353,6 +353,8 @@ class SlaveSide(_Side):
         """of what is felt, in standard deviations [1]"""
         self.force_scale = force_scale
         """force felt per force of the environment [1]"""
+        self.wall = np.array(options.wall[:n])
+        """(n,) stiffness with which the end of the workspace is shown [N/m, N m/rad]"""
         self.torque_scale = force_scale * turn_scale / motion_scale
         """torque felt per torque of the environment [1]"""
         super().__init__(n, session)

@@ -80,9 +80,11 @@ class SlaveEnd:
         # noise is no work: the reference pays for what is felt
         std = seen.std if seen.felt_std is None else seen.felt_std
         port: Array = felt_force(seen.force, std, self.side.threshold)
-        command = self.side.step(
-            seen.x, seen.v, seen.force, std, PERIOD, now_ns, port=port, allowed=seen.usable
-        )
+        force = seen.force
+        if seen.beyond is not None:
+            # the end of what the arm can follow is felt like the end of the workspace
+            force, std = port - self.side.wall * seen.beyond, np.zeros(len(port))
+        command = self.side.step(seen.x, seen.v, force, std, PERIOD, now_ns, port=port, allowed=seen.usable)
         self.slave.follow(command.position, command.velocity, command.force)
         out = "end of the slave's workspace" if command.events & Event.WORKSPACE else ""
         self.reason = seen.reason or out

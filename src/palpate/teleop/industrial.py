@@ -98,6 +98,7 @@ class IndustrialSlave(InScene):
             self._reason,
             felt.good and self._lost == 0,
             np.concatenate((seen_std if felt.good else unknown, unknown)),
+            self._beyond,
         )
 
     def follow(self, x_ref: Array, v_ref: Array, push: Array | None = None) -> Array:

@@ -32,6 +32,8 @@ _SINGULAR = 0.08
 """least singular value of the tip's Jacobian [m, 1] below which the arm slows down"""
 CLOSING = 100.0
 """with which the joints' reference closes on the tip's [1/s]"""
+_CATCHING_UP = (0.3, 1.5)
+"""no faster than so: near a singular pose it would run to and fro [m/s, rad/s]"""
 STIFFENING = 40.0
 """bandwidth with which the external torque is taken off [rad/s]: well below the observer's, which is half a period
 late"""
@@ -67,6 +69,8 @@ class Seen:
         reason: why it holds or slows down, empty: it does not.
         usable: it may be moved.
         felt_std: (6,) deviation that decides what a hand is shown [N, N m]; None: `std`.
+        beyond: (6,) from where the arm can be to its reference, while a singular pose, a joint's limit or its largest
+            speed holds it back [m, rad]; None: nothing does.
     """
 
     time_ns: int
@@ -79,6 +83,7 @@ class Seen:
     reason: str
     usable: bool
     felt_std: Array | None = None
+    beyond: Array | None = None
 
 
 class Stiffness:
@@ -198,6 +203,7 @@ class ArmSlave:
         )
         self._R0 = rotation_vector(self._pose(self._q_ref)[0].ravel())
         self._reason = ""
+        self._beyond: Array | None = None
         self.seen = self._see()
 
     def hold(self, mass: float) -> None:
@@ -248,7 +254,7 @@ class ArmSlave:
         else:
             force = force - self._tare if good else force
         usable = self._tare is not None and self._lost == 0
-        return Seen(self._sample.time_ns, q, dq, pose_of(R, tip), J @ dq, force, std, self._reason, usable)
+        return Seen(self._sample.time_ns, q, dq, pose_of(R, tip), J @ dq, force, std, self._reason, usable, beyond=self._beyond)
 
     def read(self) -> Seen:
         """The next period's sample. A lost one holds the last; a device that is gone stops the arm, and says so.
@@ -292,23 +298,26 @@ class ArmSlave:
         n, h = self.model.n, self._period
         R, tip, J = self._pose(self._q_ref)
         # both references are of the end of this period: what is compared is where they were at its beginning
-        task = v_ref + CLOSING * (pose_minus(x_ref, pose_of(R, tip)) - h * v_ref)
+        away = pose_minus(x_ref, pose_of(R, tip)) - h * v_ref
+        closing = CLOSING * away
+        for axes, fastest in zip(_PARTS, _CATCHING_UP, strict=True):
+            closing[axes] *= min(1.0, fastest / max(fastest, float(np.linalg.norm(closing[axes]))))
         U, s, Vt = np.linalg.svd(J, full_matrices=True)
-        damp = 0.0 if s[-1] >= _SINGULAR else 0.02 * (1.0 - (s[-1] / _SINGULAR) ** 2)
-        self._reason = (
-            "" if s[-1] >= _SINGULAR else f"slave near a singular pose (least singular value {s[-1]:.3f})"
-        )
-        rates = Vt[: len(s)].T @ (s / (s * s + damp) * (U.T @ task))
+        singular = s[-1] < _SINGULAR
+        damp = 0.02 * (1.0 - (s[-1] / _SINGULAR) ** 2) if singular else 0.0
+        self._reason = "slave near a singular pose: it gives up what it cannot follow" if singular else ""
+        rates = Vt[: len(s)].T @ (s / (s * s + damp) * (U.T @ (v_ref + closing)))
         if n > 6:
             spare = Vt[6:]
             rates = rates + spare.T @ (spare @ (1.0 * (self._home - self._q_ref)))
         over = float(np.max(np.abs(rates) / self._fastest))
         if over > 1.0:
-            rates, self._reason = rates / over, "a joint of the slave at its largest speed"
+            rates, self._reason = rates / over, self._reason or "a joint of the slave at its largest speed"
         wanted = self._q_ref + h * rates
         inside = np.clip(wanted, self._low, self._high)
         if np.any(inside != wanted):
             self._reason = "a joint of the slave at its limit: the master points out of its reach"
+        self._beyond = away if self._reason else None
         # a reference that jerks would be taken for a touch: torque and differentiated velocity are half a period apart
         ddq_ref = np.clip(((inside - self._q_ref) / h - self._dq_ref) / h, -_JERKY, _JERKY)
         rates = self._dq_ref + h * ddq_ref
