@@ -206,7 +206,9 @@ def test_a_singular_pose_is_held_told_felt_and_left_again(monkeypatch: pytest.Mo
     from palpate.teleop import setups
 
     monkeypatch.setattr(setups, "REACH", 1.0)
-    way = scenes.through([(1.5, (0.0,) * 3), (3.0, (0.4, 0.0, 0.0)), (3.6, (0.4, 0.0, 0.0)), (5.0, (0.0,) * 3)])
+    way = scenes.through(
+        [(1.5, (0.0,) * 3), (3.0, (0.4, 0.0, 0.0)), (3.6, (0.4, 0.0, 0.0)), (5.0, (0.0,) * 3)]
+    )
     setup = build(None, hand=Hand(wish=way))
     slave = setup.slave
     run = setup.run(seconds=7.5)
@@ -218,3 +220,16 @@ def test_a_singular_pose_is_held_told_felt_and_left_again(monkeypatch: pytest.Mo
     assert len(told) == 1 and "gives up" in told[0]
     assert run.felt[:, 0].min() == pytest.approx(-8.5)  # as hard as the device can
     assert np.linalg.norm(run.tip[-1] - run.wanted[-1]) < 3e-3 and not run.holding
+
+
+def test_four_channels_over_a_delay_come_to_rest_at_a_rigid_wall_and_make_no_energy() -> None:
+    faults = Faults(delay=0.1, jitter=0.02, loss=0.1)
+    run = build("rigid", coupling="four_channel").run(seconds=6.0, faults=faults)
+    given, taken = (sum(tank[name] for tank in run.tanks.values()) for name in ("given", "taken"))
+    assert given <= taken + 2.0 * 0.05 + 1e-6
+    assert min(tank["lowest"] for tank in run.tanks.values()) > -1e-6
+    late = run.time > 5.0
+    pressed = np.linalg.norm(run.true[late], axis=1)
+    assert pressed.min() > 3.0 and pressed.std() < 0.1 * pressed.mean()
+    assert np.linalg.norm(run.tip_velocity[late], axis=1).max() < 5e-3
+    assert np.abs(run.force).max() <= 8.5

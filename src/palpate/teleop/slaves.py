@@ -254,7 +254,18 @@ class ArmSlave:
         else:
             force = force - self._tare if good else force
         usable = self._tare is not None and self._lost == 0
-        return Seen(self._sample.time_ns, q, dq, pose_of(R, tip), J @ dq, force, std, self._reason, usable, beyond=self._beyond)
+        return Seen(
+            self._sample.time_ns,
+            q,
+            dq,
+            pose_of(R, tip),
+            J @ dq,
+            force,
+            std,
+            self._reason,
+            usable,
+            beyond=self._beyond,
+        )
 
     def read(self) -> Seen:
         """The next period's sample. A lost one holds the last; a device that is gone stops the arm, and says so.
