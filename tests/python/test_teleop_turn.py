@@ -114,8 +114,7 @@ def test_a_wrist_turns_a_gimbal_and_its_motors_turn_it_back() -> None:
 pytest.importorskip("mujoco", reason="palpate[sim] is not installed")
 pytest.importorskip("cryptography", reason="palpate[teleop] is not installed")
 
-from palpate.studies._teleop_slaves import circle  # noqa: E402
-from palpate.studies._teleop_turning import wrist  # noqa: E402
+from palpate.studies._teleop_turning import circle, wrist  # noqa: E402
 from palpate.teleop import scenes  # noqa: E402
 from palpate.teleop.channel import Faults  # noqa: E402
 from palpate.teleop.figures import transparency, turning  # noqa: E402
@@ -124,7 +123,7 @@ from palpate.teleop.setups import TURN_REACH, build  # noqa: E402
 
 
 def test_the_tool_turns_as_the_hand_does_while_it_moves() -> None:
-    run = build(None, hand=Hand(wish=circle(0.1), wish_turn=wrist)).run(seconds=4.5)
+    run = build(None, hand=Hand(wish=circle, wish_turn=wrist)).run(seconds=4.5)
     found = turning(run)
     assert found.spin > 0.8 and found.tracking < 1e-3
     assert transparency(run).tracking < 2e-3

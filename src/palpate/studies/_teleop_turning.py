@@ -15,12 +15,18 @@ from ..teleop.scenes import smooth
 from ..teleop.setups import build
 from . import Row
 from ._rows import at_most, told
-from ._teleop_hands import circle
 from ._teleop_slaves import ABB, IIWA
 
 JOBS, QUICK_JOBS = 4, 2
 _WOBBLE = np.array([0.3, 0.25, 0.4]), np.array([2.0, 1.7, 2.4])
 """amplitudes [rad] and rates [rad/s] of the wrist about three axes"""
+
+
+def circle(time: float) -> Array:
+    """The hand's way in free motion, at a quarter of a metre per second once it has begun."""
+    t, radius = max(0.0, time - SETTLED), 0.1
+    angle = 0.25 / radius * t
+    return smooth(t / 1.5) * radius * np.array([math.sin(angle), math.cos(angle), 0.0])
 
 
 def wrist(time: float) -> Array:
@@ -33,8 +39,8 @@ def wrist(time: float) -> Array:
 def rows(quick: bool, done: Callable[[], None]) -> list[Row]:
     """All rows; `done` after each run."""
     found = []
-    for arm, name, radius in ((IIWA, "iiwa", 0.1),) if quick else ((IIWA, "iiwa", 0.1), (ABB, "ABB", 0.1)):
-        run = build(None, arm=arm, hand=Hand(wish=circle(radius), wish_turn=wrist)).run(
+    for arm, name in ((IIWA, "iiwa"),) if quick else ((IIWA, "iiwa"), (ABB, "ABB")):
+        run = build(None, arm=arm, hand=Hand(wish=circle, wish_turn=wrist)).run(
             seconds=4.0 if quick else 10.0
         )
         done()
