@@ -257,14 +257,14 @@ def _rows(
             )
         )
     for side, taken in times.items():
-        p50, p999, worst = (1e6 * float(x) for x in (*np.quantile(taken, (0.5, 0.999)), taken.max()))
+        p50, p999, last = (1e6 * float(x) for x in (*np.quantile(taken, (0.5, 0.999)), taken.max()))
         rows.append(
             at_most(
                 f"one step of the {side}'s side, median",
                 10.0,
                 p50,
                 "us",
-                f"six axes, four-channel; 99.9 % {p999:.1f} us, worst of {len(taken)}: {worst:.0f} us, the computer's "
+                f"six axes, four-channel; 99.9 % {p999:.1f} us, worst of {len(taken)}: {last:.0f} us, the computer's "
                 "own pauses included",
             )
         )
