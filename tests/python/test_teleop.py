@@ -17,7 +17,6 @@ from palpate.teleop import (
     Event,
     Hand,
     HapticDevice,
-    Keys,
     MasterSide,
     Message,
     SlaveSide,
@@ -124,24 +123,6 @@ def test_a_hand_on_a_device_goes_where_it_wishes() -> None:
     assert device.read()[0][0] == pytest.approx(0.05 - 8.5 / 400.0, abs=1e-4)
     with pytest.raises(InputError, match="mass > 0"):
         Hand(mass=0.0)
-
-
-def test_keys_and_sticks_make_a_smooth_bounded_motion() -> None:
-    keys = Keys(speed=0.1)
-    assert keys.press("w") and keys.press("a") and not keys.press("?")
-    last = np.zeros(3)
-    for _ in range(500):
-        keys.step(np.zeros(3), H)
-        _, v = keys.read()
-        assert np.linalg.norm(v) <= 0.1 + 1e-12 and np.linalg.norm(v - last) < 0.003
-        last = v
-    assert last == pytest.approx([0.1 / 2**0.5, 0.1 / 2**0.5, 0.0], abs=1e-4)
-    keys.release("w")
-    keys.release("a")
-    keys.stick(0.0, float("nan"), -5.0)
-    for _ in range(500):
-        keys.step(np.zeros(3), H)
-    assert keys.read()[1] == pytest.approx([0.0, 0.0, -0.1], abs=1e-4)
 
 
 # --- in MuJoCo --------------------------------------------------------------------------------------------------------

@@ -214,7 +214,7 @@ def test_clocks_minutes_apart_hold_both_with_the_reason() -> None:
         (["slave", "lift"], "run lift"),
         (["slave", "--bind", "here"], "--bind"),
         (["master", "--connect", "x:99999"], "--connect"),
-        (["master", "--device", "glove"], "--device"),
+        (["master", "--master", "glove"], "--master"),
         (["master", "--key", "none"], "cannot be read"),
     ],
 )

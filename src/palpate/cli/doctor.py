@@ -24,6 +24,7 @@ _EXTRAS = {
     "sim": (("mujoco",), "simulated arms"),
     "report": (("matplotlib",), "reports and pictures"),
     "logs": (("rosbags", "lz4"), "compressed bags, any ROS 2 message"),
+    "gamepad": (("evdev",), "gamepads and SpaceMice that lead an arm"),
     "dynamixel": (("dynamixel_sdk",), "arms of Dynamixel servos"),
     "feetech": (("scservo_sdk",), "arms of Feetech servos"),
     "ur": (("rtde_control", "rtde_receive"), "Universal Robots arms (Python up to 3.12)"),

@@ -6,7 +6,6 @@ import math
 import sys
 import time
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import typer
 from typer.core import TyperGroup
 
-from ..errors import InputError
+from ..errors import InputError, suggest
 from . import STOPPED
 from ._common import (
     Json,
@@ -36,10 +35,10 @@ VIEW_S = 600.0
 """how long a viewed run is where nobody says [s]"""
 
 if TYPE_CHECKING:
-    from ..teleop import CouplingName, Faults, UdpChannel
+    from ..teleop import CouplingName, Faults, RateMaster, UdpChannel
     from ..teleop.ends import MasterEnd, SlaveEnd
     from ..teleop.masters import Device
-    from ..teleop.session import Cut, Tap
+    from ..teleop.session import Cut, Run, Tap, Wish
     from ..teleop.setups import Setup
 
 
@@ -106,6 +105,33 @@ _ForceScale = Annotated[
         show_default=False,
     ),
 ]
+_Master = Annotated[
+    str,
+    typer.Option(
+        "--master",
+        metavar="NAME",
+        help="Who moves the arm: hand (simulated, does what the scene asks for), gamepad, spacemouse or keyboard.",
+    ),
+]
+_Device = Annotated[
+    str | None,
+    typer.Option(
+        "--device",
+        metavar="PATH",
+        help="Which gamepad or SpaceMouse, such as /dev/input/event5; see palpate teleop devices. "
+        "[default: the only one]",
+        show_default=False,
+    ),
+]
+_Speed = Annotated[
+    float | None,
+    typer.Option(
+        "--speed",
+        metavar="M/S",
+        help="Of gamepad, spacemouse or keyboard at full deflection, before the motion scale. [default: 0.1]",
+        show_default=False,
+    ),
+]
 
 
 class _Verbs(TyperGroup):
@@ -149,7 +175,8 @@ def add(app: typer.Typer) -> None:
             "palpate teleop run lift --mass 0.4 --mass 1.5",
             "palpate teleop run wall --cut 5@1.5",
             "palpate teleop run rigid --view",
-            "palpate teleop run rigid --view",
+            "palpate teleop run free --arm so101 --view",
+            "palpate teleop run surface --master gamepad --view",
         ),
     )(run)
     verbs.command(
@@ -165,13 +192,18 @@ def add(app: typer.Typer) -> None:
     verbs.command(
         "master",
         help="The hand's side, a process of its own.\n\n"
-        "The device is a simulated one in a hand that follows a scene's script, or the keys of this terminal "
-        "(w a s d, q and e), which move and feel nothing.",
+        "The device is a simulated one in a hand that follows a scene's script, or what a person moves: a gamepad, a "
+        "SpaceMouse, the keys of this terminal. These give a speed; the force they cannot give is told, and rumbles.",
         epilog=examples(
             "palpate teleop master --connect 127.0.0.1:5005 --key teleop.key",
-            "palpate teleop master --connect 192.168.1.20:5005 --key teleop.key --device keys --record master.mcap",
+            "palpate teleop master --connect 192.168.1.20:5005 --key teleop.key --master keyboard --record master.mcap",
         ),
     )(master)
+    verbs.command(
+        "devices",
+        help="List gamepads and SpaceMice that can be masters, and what to do where there are none.",
+        epilog=examples("palpate teleop devices", "palpate teleop devices --json"),
+    )(devices)
     verbs.command(
         "key",
         help="Write a new key, readable by you alone; copy it to the other machine by a safe way.",
@@ -196,6 +228,28 @@ def key(
     emit({"key": str(path)}) if json else say(
         f"{path}: a new key, readable by you alone; both machines need the same"
     )
+    return 0
+
+
+def devices(json: Json = False) -> int:
+    """List input devices."""
+    from ..teleop.input_devices import KINDS, advice, connected
+
+    found = connected()
+    hint = advice(found)
+    if json:
+        fields = [{"path": f.path, "name": f.name, "kind": f.kind, "problem": f.problem} for f in found]
+        emit({"devices": fields, "advice": hint})
+        return 0
+    shown: list[tuple[str, Any]] = [(f.path, f"{f.kind}: {f.name}") for f in found if f.kind is not None]
+    shown += [(f.path, f.problem) for f in found if f.problem]
+    print_rows(shown)
+    if others := sum(f.kind is None and not f.problem for f in found):
+        say(f"{others} other input devices")
+    if hint:
+        say(hint)
+    for kind in KINDS.values():
+        say(f"palpate teleop run wall --view --master {kind.name}: {kind.usage}")
     return 0
 
 
@@ -265,10 +319,9 @@ def master(
         str, typer.Option(metavar="HOST:PORT", help="Where the slave listens.")
     ] = "127.0.0.1:5005",
     key: _Key = Path("teleop.key"),
-    device: Annotated[
-        str,
-        typer.Option(metavar="NAME", help="hand (simulated, follows a script) or keys (of this terminal)."),
-    ] = "hand",
+    master: _Master = "hand",
+    device: _Device = None,
+    speed: _Speed = None,
     script: Annotated[
         str,
         typer.Option(
@@ -296,28 +349,52 @@ def master(
     quiet: Quiet = False,
 ) -> int:
     """Be the master."""
-    from ..teleop import HapticDevice, Keys, UdpChannel, read_key
+    from ..teleop import HapticDevice, UdpChannel, read_key
     from ..teleop.ends import MasterEnd
-    from ..teleop.masters import TerminalKeys
     from ..teleop.scenes import find
     from ..teleop.setups import Shared, build_master, scripted
 
-    if device not in ("hand", "keys"):
-        raise InputError(f"--device: expected hand or keys, got {device!r}")
     peer = _address("--connect", connect)
     here = peer[0] in ("127.0.0.1", "localhost")
     local = _address("--bind", bind) if bind is not None else ("127.0.0.1" if here else "0.0.0.0", 0)
     faults = _faults(delay, jitter, loss, duplicate)
-    channel = UdpChannel(read_key(key), "master", 6, local=local, peer=peer, faults=faults, seed=seed)
     shared = Shared(_coupling(coupling), passivity, session=None)
     with ExitStack() as stack:
-        held: Device
-        if device == "keys":
-            held = stack.enter_context(TerminalKeys(Keys()))
-        else:
+        held: Device | None = _moved(master, device, speed, stack)
+        if held is None:
             held = HapticDevice(scripted(None if script == "free" else find(script, np.zeros(3))))
+        channel = UdpChannel(read_key(key), "master", 6, local=local, peer=peer, faults=faults, seed=seed)
         end = MasterEnd(held, build_master(held, shared))
         return _serve(end, channel, record, seconds, json=json, quiet=quiet)
+
+
+def _moved(master: str, device: str | None, speed: float | None, stack: ExitStack) -> RateMaster | None:
+    """What a person moves, closed with the stack; None: the simulated hand does."""
+    from ..teleop import InputSource, RateMaster, TerminalKeys
+    from ..teleop.input_devices import KINDS
+    from ..teleop.rate_control import Source
+
+    names = ("hand", *KINDS, "keyboard")
+    if master not in names:
+        raise InputError(f"--master: {suggest(master, names, 'expected one of')} got {master!r}")
+    if device is not None and master not in KINDS:
+        raise InputError(
+            f"--device says which gamepad or spacemouse; --master {master} has none to choose from"
+        )
+    if master == "hand":
+        if speed is not None:
+            raise InputError(
+                "--speed is for gamepad, spacemouse or keyboard; the hand is as fast as its scene"
+            )
+        return None
+    if speed is not None and not 0.0 < speed <= 1.0:
+        raise InputError(f"--speed: expected above 0 to 1 m/s, got {speed!r}")
+    source: Source = (
+        stack.enter_context(TerminalKeys()) if master == "keyboard" else InputSource(master, device)
+    )
+    found = RateMaster(source) if speed is None else RateMaster(source, speed=speed)
+    stack.callback(found.close)
+    return found
 
 
 def _serve(
@@ -388,6 +465,9 @@ def _coupling(name: str) -> CouplingName:
 def run(
     scene: _Scene = "wall",
     arm: _Arm = "kuka_lbr_iiwa14",
+    master: _Master = "hand",
+    device: _Device = None,
+    speed: _Speed = None,
     coupling: _Coupling = "force_position",
     stiffness: _Stiffness = 2000.0,
     press: Annotated[
@@ -459,33 +539,41 @@ def run(
         make_folder(out)
         check_target(page, is_report, "the report")
         check_target(log, is_recording, "the recording")
-    setup = build(
-        None if scene == "free" else scene,
-        arm=arm,
-        coupling=chosen,
-        stiffness=stiffness,
-        press=press,
-        masses=tuple(mass) if mass else None,
-        motion_scale=motion_scale,
-        force_scale=force_scale,
-        torque_limit=torque,
-        passive=passivity,
-        seed=seed,
-    )
     options: dict[str, Any] = {}
     with ExitStack() as stack:
-        if view:
-            options["tap"], seconds = _page(setup, faults, listen, stack, seconds), seconds or VIEW_S
-        stopped = stack.enter_context(interruptible())
-        bar = stack.enter_context(_Bar(silent=json or quiet or view))
-        result = setup.run(
-            seconds=seconds, faults=faults, cuts=cuts, progress=bar, seed=seed, stop=stopped, **options
+        moved = _moved(master, device, speed, stack)
+        setup = build(
+            None if scene == "free" else scene,
+            arm=arm,
+            coupling=chosen,
+            stiffness=stiffness,
+            press=press,
+            masses=tuple(mass) if mass else None,
+            motion_scale=motion_scale,
+            force_scale=force_scale,
+            torque_limit=torque,
+            device=moved,
+            passive=passivity,
+            seed=seed,
         )
-        ended = stopped() and not view
+        live = view or moved is not None
+        length = VIEW_S if live and seconds is None else seconds
+        stopped = stack.enter_context(interruptible())
+        if view:
+            options["tap"] = _page(setup, faults, listen, stack, VIEW_S if length is None else length)
+        elif moved is not None:
+            pilot = stack.enter_context(_Pilot(moved, faults, silent=json or quiet))
+            options["tap"] = pilot.tap
+        bar = stack.enter_context(_Bar(silent=json or quiet or live))
+        result = setup.run(
+            seconds=length, faults=faults, cuts=cuts, progress=bar, seed=seed, stop=stopped, **options
+        )
+        ended = stopped() and not live
     files: dict[str, str] = {}
     settings: dict[str, object] = {
         "scene": scene,
         "arm": arm,
+        "master": master if moved is None else f"{master}, {moved.source.name}",
         "coupling": coupling,
         "passivity layer": "on" if passivity else "off",
         "motion scale": setup.motion_scale,
@@ -521,21 +609,16 @@ def run(
     return STOPPED if ended else 0
 
 
-def _page(setup: Setup, faults: Faults | None, listen: str, stack: ExitStack, seconds: float | None) -> Tap:
+def _page(setup: Setup, faults: Faults | None, listen: str, stack: ExitStack, seconds: float) -> Tap:
     """A live page of what runs, closed with the stack; its tap."""
-    from ..teleop.masters import HapticDevice
-    from ..view.teleop import Person, TeleopPage
+    from ..view.teleop import TeleopPage, take_over
     from .view import address
 
     host, port = address(listen)
-    device = setup.device
-    if not isinstance(device, HapticDevice):
-        raise InputError("--view shows a haptic device and its arm; a leader arm and its twin have no page")
-    person = Person(device.hand.wish, setup.seconds)
-    device.hand = replace(device.hand, wish=person)
+    person = take_over(setup)
     page = TeleopPage(setup, person=person, faults=faults, host=host, port=port)
     stack.callback(page.close)
-    say(f"{page.url}   Ctrl-C ends, and so do {seconds or VIEW_S:g} s")
+    say(f"{page.url}   Ctrl-C ends, and so do {seconds:g} s")
     sys.stdout.flush()
     return page.tap
 
@@ -551,6 +634,51 @@ def _cut(text: str) -> Cut:
     if not (found.at >= 0.0 and 0.0 < found.seconds <= 3600.0):
         raise InputError(f"--cut: expected a time >= 0 and a length above 0 to 3600 s, got {text!r}")
     return found
+
+
+class _Pilot:
+    """Real time for a person without a page: where the arm is and what it feels, in one line of the terminal."""
+
+    def __init__(self, moved: RateMaster, faults: Faults | None, *, silent: bool) -> None:
+        from ..teleop import Faults
+        from ..teleop.pace import Pace
+        from ..teleop.session import Wish
+
+        self._moved, self._silent, self._pace = moved, silent, Pace()
+        self._wish = Wish(faults or Faults())
+        self._said = ""
+        self._status: Any = None
+
+    def __enter__(self) -> _Pilot:
+        if not self._silent:
+            say(f"{self._moved.source.name}: {self._moved.source.usage}   Ctrl-C ends")
+            sys.stdout.flush()
+            if console().is_terminal:
+                self._status = console().status("starting")
+                self._status.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._status is not None:
+            self._status.stop()
+
+    def tap(self, k: int, run: Run) -> Wish:
+        """At the end of every period."""
+        self._pace.wait(k)
+        if k % 100 == 0 and not self._silent:
+            reason = run.reasons[-1][1] if run.holding else ""
+            if reason != self._said:
+                self._said = reason
+                say(f"! {reason or 'free again'}")
+                sys.stdout.flush()
+            if self._status is not None:
+                x, y, z = 1e3 * (run.tip[k] - run.tip[0])
+                felt = float(np.linalg.norm(run.felt[k]))
+                self._status.update(
+                    f"{run.time[k]:.0f} s   arm {x:+.0f} {y:+.0f} {z:+.0f} mm   felt {felt:.1f} N   "
+                    f"{reason or self._moved.status or 'moves'}"
+                )
+        return self._wish
 
 
 class _Bar:

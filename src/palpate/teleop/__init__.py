@@ -26,7 +26,9 @@ from .coupling import (
     event_words,
     felt_force,
 )
-from .masters import Hand, HapticDevice, Keys
+from .input_devices import InputSource
+from .masters import Hand, HapticDevice
+from .rate_control import RateMaster, TerminalKeys
 
 __all__ = [
     "COUPLINGS",
@@ -38,15 +40,17 @@ __all__ = [
     "FaultyLine",
     "Hand",
     "HapticDevice",
-    "Keys",
+    "InputSource",
     "LinkOptions",
     "MasterCommand",
     "MasterSide",
     "Message",
+    "RateMaster",
     "Sealer",
     "SlaveCommand",
     "SlaveSide",
     "TankOptions",
+    "TerminalKeys",
     "UdpChannel",
     "event_words",
     "felt_force",

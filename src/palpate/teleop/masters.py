@@ -1,15 +1,11 @@
-"""Masters: a simulated haptic device in a simulated hand, keys and sticks; all give a place and take a force."""
+"""Masters give a place and take a force: what all have in common, and a simulated haptic device in a simulated hand."""
 
 from __future__ import annotations
 
 import math
-import os
-import select
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 
@@ -179,117 +175,3 @@ class HapticDevice:
             ),
             np.concatenate((self.v, self.spin)),
         )
-
-
-class TerminalKeys:
-    """Keys of the terminal: each moves while it repeats, for a terminal tells no release.
-
-    Args:
-        keys: what they move.
-        hold: how long a key counts after it was seen [s]; longer than the pause before a keyboard repeats it.
-
-    Raises:
-        InputError: there is no terminal.
-    """
-
-    def __init__(self, keys: Keys, hold: float = 0.5) -> None:
-        if not sys.stdin.isatty():
-            raise InputError("--device keys needs a terminal to read keys from; this input is none")
-        self._keys, self._hold = keys, hold
-        self._down: dict[str, float] = {}
-        self.force_limit = keys.force_limit
-
-    def __enter__(self) -> Self:
-        import termios
-        import tty
-
-        self._before = termios.tcgetattr(sys.stdin)
-        tty.setcbreak(sys.stdin)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        import termios
-
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
-
-    def read(self) -> tuple[Array, Array]:
-        """(3,) place [m], (3,) velocity [m/s]."""
-        return self._keys.read()
-
-    def step(self, force: Array, dt: float) -> None:
-        """Take the keys that were pressed, and go on by a period [s]."""
-        while select.select([sys.stdin], [], [], 0.0)[0]:
-            key = os.read(sys.stdin.fileno(), 1).decode(errors="ignore").lower()
-            if not key:
-                break
-            if self._keys.press(key):
-                self._down[key] = self._hold
-        for key in list(self._down):
-            self._down[key] -= dt
-            if self._down[key] <= 0.0:
-                del self._down[key]
-                self._keys.release(key)
-        self._keys.step(force, dt)
-
-
-class Keys:
-    """Keyboard, gamepad or SpaceMouse as a master: buttons and sticks give a velocity; what is felt can only be shown.
-
-    Args:
-        speed: with a key down or a stick at its end [m/s].
-        smooth: time constant of starting and stopping [s].
-        bindings: which key moves where; None: w a s d in the plane, q and e up and down.
-    """
-
-    BINDINGS: Mapping[str, tuple[float, float, float]] = {
-        "w": (1.0, 0.0, 0.0),
-        "s": (-1.0, 0.0, 0.0),
-        "a": (0.0, 1.0, 0.0),
-        "d": (0.0, -1.0, 0.0),
-        "q": (0.0, 0.0, 1.0),
-        "e": (0.0, 0.0, -1.0),
-    }
-
-    def __init__(
-        self,
-        speed: float = 0.1,
-        smooth: float = 0.05,
-        bindings: Mapping[str, tuple[float, float, float]] | None = None,
-    ) -> None:
-        if not (speed > 0.0 and smooth > 0.0):
-            raise InputError(f"speed and smooth must be > 0, got {speed!r} and {smooth!r}")
-        self._speed, self._smooth = speed, smooth
-        self._bindings = dict(self.BINDINGS if bindings is None else bindings)
-        self._down: set[str] = set()
-        self._stick = np.zeros(3)
-        self.force_limit = 8.5
-        """what is told as felt, at most [N]"""
-        self._x, self._v = np.zeros(3), np.zeros(3)
-
-    def press(self, key: str) -> bool:
-        """A key goes down; False: it is bound to nothing."""
-        if key in self._bindings:
-            self._down.add(key)
-        return key in self._bindings
-
-    def release(self, key: str) -> None:
-        """A key goes up."""
-        self._down.discard(key)
-
-    def stick(self, x: float, y: float, z: float) -> None:
-        """Sticks of a gamepad or the cap of a SpaceMouse, each from -1 to 1."""
-        self._stick = np.clip(np.nan_to_num([x, y, z]), -1.0, 1.0)
-
-    def step(self, force: Array, dt: float) -> None:
-        """Go on by a period [s]; keys cannot push back."""
-        wanted = sum((np.array(self._bindings[k]) for k in self._down), self._stick)
-        size = float(np.linalg.norm(wanted))
-        wanted = self._speed * wanted / max(1.0, size)
-        self._v = self._v - math.expm1(-dt / self._smooth) * (wanted - self._v)
-        self._x = self._x + dt * self._v
-
-    def read(self) -> tuple[Array, Array]:
-        """(3,) place [m], (3,) velocity [m/s]."""
-        return self._x.copy(), self._v.copy()

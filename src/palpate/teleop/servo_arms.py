@@ -138,11 +138,12 @@ class HeldPlant(Plant):
     """
 
     def __init__(self, arm: Arm, hand: Hand) -> None:
-        self._hand = hand
+        self.hand = hand
+        """who holds it"""
         super().__init__(arm, timestep=5e-4, integrator="discrete")
 
     def _advance(self, tau: Array, count: int, h: float) -> None:
-        mine = tau + self._hand.force(self.time_ns * 1e-9, self._q, self._dq)
+        mine = tau + self.hand.force(self.time_ns * 1e-9, self._q, self._dq)
         np.subtract(mine, self._offset, out=self._applied)
         super()._advance(tau, count, h)
 
@@ -160,10 +161,18 @@ class SimulatedLeader(LeaderArm):
     def __init__(self, arm: Arm, q: Array, hand: Hand, *, seed: int = 0) -> None:
         known = with_servos(arm)
         rotors = tuple(j.replace(rotor_inertia=j.rotor_inertia + hand.mass) for j in known.joints)
-        plant = HeldPlant(known.replace(joints=rotors), hand)
+        self.plant = HeldPlant(known.replace(joints=rotors), hand)
         sensor = SensorModel(known, rate=BUS_RATE, seed=seed)
-        self.plant = plant
-        super().__init__(MujocoDriver(plant, sensor=sensor, q=q), known)
+        super().__init__(MujocoDriver(self.plant, sensor=sensor, q=q), known)
+
+    @property
+    def hand(self) -> Hand:
+        """Who holds it."""
+        return self.plant.hand
+
+    @hand.setter
+    def hand(self, hand: Hand) -> None:
+        self.plant.hand = hand
 
 
 class ServoSlave(InScene):

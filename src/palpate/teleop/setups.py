@@ -9,6 +9,7 @@ import numpy as np
 
 from .._core import LinkOptions, TankOptions
 from ..arm import Array
+from ..errors import InputError
 from .channel import Faults
 from .coupling import CouplingName, MasterSide, SlaveSide
 from .industrial import IndustrialSlave
@@ -107,6 +108,7 @@ def build(
     force_scale: float | None = None,
     torque_limit: float | None = None,
     hand: Hand | None = None,
+    device: Device | None = None,
     passive: bool = True,
     stiffest: float = STIFFEST,
     seed: int = 0,
@@ -124,7 +126,8 @@ def build(
         force_scale: force felt per force of the environment [1]; None: what suits device and arm.
         torque_limit: largest torque of the device [N m]; 0: its gimbal is measured and has no motors, None: it has them
             in the scene "turn" alone.
-        hand: who holds the device; None: the scene's script.
+        hand: who holds the simulated device; None: the scene's script.
+        device: what a person moves, in place of the simulated one.
         passive: the passivity layer.
         stiffest: beyond this stiffness of what it touches the slave gives way [N/m]; infinite: it never does.
         seed: of the sensors' noise.
@@ -148,8 +151,12 @@ def build(
         stiffest=stiffest,
         seed=seed,
     )
-    device: Device
-    if chosen.kind == "servos":
+    assumed = assumed if chosen.kind == "servos" or device is not None else (*assumed, _TURN_ASSUMED)
+    if device is not None:
+        if chosen.kind == "servos":
+            raise InputError(f"{arm} is led joint by joint by its twin; such a device moves another arm")
+        master = build_master(device, shared)
+    elif chosen.kind == "servos":
         device = SimulatedLeader(chosen.arm, chosen.q, hand or scripted_joints(place, chosen), seed=seed + 1)
         motion_scale = 1.0
         master = _leading(chosen.arm.n, device, shared)
@@ -166,7 +173,7 @@ def build(
         follower=follower,
         motion_scale=motion_scale,
         seconds=10.0 if place is None else place.seconds,
-        assumed=assumed if chosen.kind == "servos" else (*assumed, _TURN_ASSUMED),
+        assumed=assumed,
     )
 
 

@@ -6,8 +6,8 @@ import contextlib
 import io
 import math
 import threading
-import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +20,10 @@ from ..report._text import escape
 from ..teleop.channel import Faults
 from ..teleop.coupling import Event, event_words
 from ..teleop.ends import PERIOD
+from ..teleop.masters import HapticDevice
+from ..teleop.pace import Pace
 from ..teleop.scenes import smooth
+from ..teleop.servo_arms import SimulatedLeader
 from ..teleop.session import Run, Wish
 from ..teleop.setups import Setup
 from ._guard import guarded
@@ -48,29 +51,41 @@ class Person:
     """A wish for the hand that a page can take over from the script, without a jump.
 
     Args:
-        script: where the hand wants to be at a time [s], (3,) [m]; begins anew after `seconds`.
+        script: where the hand wants to be at a time [s], (n,) [m], or [rad] at the joints of a leader; begins anew
+            after `seconds`.
         seconds: how long the script is [s].
     """
 
     def __init__(self, script: Callable[[float], Array], seconds: float) -> None:
         self._script, self._seconds = script, seconds
-        self._place = np.zeros(3)
-        self._from, self._since, self._own = np.zeros(3), -math.inf, False
+        self._rest = np.asarray(script(0.0), dtype=np.float64)
+        self._place = self._from = self._rest
+        self._since, self._own = -math.inf, False
         self._now = 0.0
 
     def __call__(self, time: float) -> Array:
-        """(3,) where the hand wants to be [m]."""
+        """(n,) where the hand wants to be [m, rad]."""
         self._now = time
         wanted = self._place if self._own else np.asarray(self._script(math.fmod(time, self._seconds)))
         part = smooth((time - self._since) / _TAKE_OVER_S)
         found: Array = self._from + part * (wanted - self._from)
         return found
 
-    def go(self, place: Array | None) -> None:
-        """From now on this place (3,) [m]; None: the script's."""
+    def go(self, away: Array | None) -> None:
+        """From now on this far (n,) from where the script begins [m, rad]; None: the script's."""
         self._from, self._since = self(self._now), self._now
-        self._own = place is not None
-        self._place = np.zeros(3) if place is None else np.asarray(place, dtype=np.float64)
+        self._own = away is not None
+        self._place = self._rest if away is None else self._rest + away
+
+
+def take_over(setup: Setup) -> Person | None:
+    """A person at the page may take the simulated hand over; None: a person moves the device already."""
+    device = setup.device
+    if not isinstance(device, HapticDevice | SimulatedLeader):
+        return None
+    person = Person(device.hand.wish, setup.seconds)
+    device.hand = replace(device.hand, wish=person)
+    return person
 
 
 class TeleopPage:
@@ -78,7 +93,7 @@ class TeleopPage:
 
     Args:
         setup: what runs.
-        person: the hand's wish, see :class:`Person`; None: it cannot be taken over.
+        person: the hand's wish, see :func:`take_over`; None: it cannot be taken over.
         faults: of the network at the start.
         host: address to listen at.
         port: 0: any free one.
@@ -111,7 +126,7 @@ class TeleopPage:
         """the clutch; set by the page"""
         self._setup, self._person = setup, person
         self._run: tuple[Run, int] | None = None
-        self._begin = math.nan
+        self._pace = Pace()
         self._over = threading.Event()
         self.frames = 0
         """updates made so far"""
@@ -251,14 +266,7 @@ class TeleopPage:
     def tap(self, k: int, run: Run) -> Wish:
         """To be called at the end of every period `k`: it keeps real time, and tells what the page wants."""
         self._run = run, k
-        now = time.monotonic()
-        if math.isnan(self._begin):
-            self._begin = now
-        ahead = self._begin + k * PERIOD - now
-        if ahead > 0.0:
-            time.sleep(ahead)
-        elif ahead < -0.1:
-            self._begin -= ahead
+        self._pace.wait(k)
         return Wish(self.faults, self.cut, self.closed)
 
     def _show(self) -> None:
