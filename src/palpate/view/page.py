@@ -54,6 +54,9 @@ _PHONE = 0.62
 _AXES = ("x", "y", "z")
 _SPEEDS = ("0.25", "0.5", "1", "2", "5", "20")
 
+PLOT_AXES: Any = tuple({"size": size, "ticks": {"size": 4}, "font": "11px system-ui"} for size in (22, 46))
+"""time below and values beside a small plot"""
+
 _STYLE = """<style>
 .pp{font-family:system-ui,sans-serif;line-height:1.35;padding:.35em .75em 0;color:#1b2430}
 .pp .mass{font-size:2.35em;font-weight:650;letter-spacing:-.02em;white-space:nowrap;font-variant-numeric:tabular-nums}
@@ -68,6 +71,10 @@ _STYLE = """<style>
 div[style*="width: 20em"]{width:100%!important}
 div[style*="max-height: 60%"]{max-height:54%!important}
 }
+.pp .nums{width:100%;font-size:.85em;color:#1b2430;border-collapse:collapse;font-variant-numeric:tabular-nums}
+.pp .nums th{font-weight:450;color:#5d6875}
+.pp .nums th,.pp .nums td{text-align:right;padding:.1em 0}
+.pp .nums td:first-child{text-align:left}
 .pp .cap{font-size:.8em;font-weight:600;margin:.15em 0 0}
 </style>"""
 
@@ -97,6 +104,48 @@ def check_address(host: str, port: int) -> None:
             f"no page can be served at {host}:{port} ({reason}): another program, maybe another palpate view, listens "
             "there. End it, or choose another port with --listen, e.g. --listen 8081 (0 takes any free one)"
         ) from None
+
+
+def look(server: ViserServer, eye: Array, middle: Array, near: float, phone: float = 1.7) -> None:
+    """How a browser looks at the scene at first. On a phone the controls cover the lower half: the scene is seen from
+    farther away, in the upper one.
+
+    Args:
+        server: of the page.
+        eye: (3,) from where [m].
+        middle: (3,) at what [m].
+        near: what is nearer is not drawn [m].
+        phone: how many times as far a phone is.
+    """
+    first = server.initial_camera
+    first.position, first.look_at = _xyz(eye), _xyz(middle)
+    first.fov, first.near = 0.75, near
+
+    def welcome(client: ClientHandle) -> None:
+        done = False
+
+        def place(camera: CameraHandle) -> None:
+            nonlocal done
+            # the browser takes the first view only after it has said hello
+            if done or not np.allclose(camera.position, eye, atol=1e-3):
+                return
+            done = True
+            if not 0.0 < camera.aspect < _PHONE:
+                return
+            away = (eye - middle) * phone
+            half_height = float(np.linalg.norm(away)) * math.tan(0.5 * camera.fov)
+            down = np.array([0.0, 0.0, 0.56 * half_height])
+            camera.position = middle + away - down
+            camera.look_at = middle - down
+
+        client.camera.on_update(place)
+
+    server.on_client_connect(welcome)
+
+
+def _xyz(place: Array) -> tuple[float, float, float]:
+    x, y, z = (float(part) for part in place)
+    return x, y, z
 
 
 class Page:
@@ -143,7 +192,6 @@ class Page:
         self._camera_folder: Any = None
         self._dress()
         self._build()
-        self._server.on_client_connect(self._welcome)
 
     # --- building ------------------------------------------------------------------------------------------------
 
@@ -180,33 +228,7 @@ class Page:
         )
         middle = 0.5 * (low + high)
         away = 1.35 * (reach + float(np.linalg.norm(high - low)))
-        self._look_at = (float(middle[0]), float(middle[1]), float(middle[2]))
-        self._eye = middle + away * np.array([0.72, -0.58, 0.38])
-        server.initial_camera.position = (float(self._eye[0]), float(self._eye[1]), float(self._eye[2]))
-        server.initial_camera.look_at = self._look_at
-        server.initial_camera.fov = 0.75
-        server.initial_camera.near = 0.01 * reach
-
-    def _welcome(self, client: ClientHandle) -> None:
-        """On a phone the controls cover the lower half: the arm is seen from farther away, in the upper one."""
-        done = False
-
-        def place(camera: CameraHandle) -> None:
-            nonlocal done
-            # the browser takes the first view only after it has said hello
-            if done or not np.allclose(camera.position, self._eye, atol=1e-3):
-                return
-            done = True
-            if not 0.0 < camera.aspect < _PHONE:
-                return
-            middle = np.array(self._look_at)
-            eye = middle + (self._eye - middle) * 1.7
-            half_height = float(np.linalg.norm(eye - middle)) * math.tan(0.5 * camera.fov)
-            down = np.array([0.0, 0.0, 0.56 * half_height])
-            camera.position = eye - down
-            camera.look_at = middle - down
-
-        client.camera.on_update(place)
+        look(server, middle + away * np.array([0.72, -0.58, 0.38]), middle, 0.01 * reach)
 
     def _build(self) -> None:
         gui, source = self._server.gui, self._source
@@ -560,8 +582,6 @@ class _Plots:
         self._captions: list[Any] = []
         self._plots: list[Any] = []
         nothing = np.array([0.0, 1.0])
-        axis = {"size": 22, "ticks": {"size": 4}, "font": "11px system-ui"}
-        side = {"size": 46, "ticks": {"size": 4}, "font": "11px system-ui"}
         for i, caption in enumerate(self._CAPTIONS):
             self._captions.append(gui.add_html(f'<div class="pp"><div class="cap">{caption}</div></div>'))
             if i == 0:
@@ -593,7 +613,7 @@ class _Plots:
                     series=tuple(series),
                     bands=bands,
                     scales={"x": uplot.Scale(time=False)},
-                    axes=(axis, side),
+                    axes=PLOT_AXES,
                     legend=uplot.Legend(show=False),
                     height=118,
                     padding=(6, 8, 0, 0),
