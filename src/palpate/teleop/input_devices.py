@@ -130,7 +130,7 @@ KINDS = {
             "gamepad",
             "a gamepad",
             "hold a shoulder button (LB, RB, L1, R1) to move: left stick forward, back, left and right, right stick up "
-            "and down",
+            "and down, and turns about up; the cross tips and rolls",
             Curve(dead=0.12, expo=0.6),
             _gamepad,
             enable=frozenset((_BTN_TL, _BTN_TR)),
@@ -138,7 +138,7 @@ KINDS = {
         Kind(
             "spacemouse",
             "a SpaceMouse",
-            "push, pull and lift the cap to move; the first button holds the arm and lets it go again",
+            "push, pull, lift and twist the cap to move; the first button holds the arm and lets it go again",
             Curve(dead=0.08, expo=0.4),
             _spacemouse,
             toggle=_BTN_0,

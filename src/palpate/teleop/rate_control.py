@@ -18,6 +18,7 @@ from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
+from .._core import turned
 from ..arm import Array
 from ..errors import DriverError, InputError
 
@@ -30,6 +31,12 @@ KEYS: dict[str, tuple[int, float]] = {
     "d": (1, -1.0),
     "q": (2, 1.0),
     "e": (2, -1.0),
+    "u": (3, -1.0),
+    "o": (3, 1.0),
+    "i": (4, 1.0),
+    "k": (4, -1.0),
+    "j": (5, 1.0),
+    "l": (5, -1.0),
 }
 """key to (axis, sign)"""
 ARROWS = {"A": "w", "B": "s", "C": "d", "D": "a"}
@@ -113,7 +120,7 @@ class RateMaster:
         turning: and of the turns [rad/s].
         smooth: time constant of starting and stopping [s].
         force_limit: what is shown as felt, at most [N].
-        axes: 3, or 6 with the turns.
+        axes: 6, or 3 without the turns.
 
     Raises:
         InputError: a number is out of range.
@@ -127,7 +134,7 @@ class RateMaster:
         turning: float = 0.5,
         smooth: float = 0.05,
         force_limit: float = 8.5,
-        axes: int = 3,
+        axes: int = AXES,
     ) -> None:
         if not all(0.0 < value < math.inf for value in (speed, turning, smooth, force_limit)):
             raise InputError(
@@ -145,7 +152,7 @@ class RateMaster:
         self._x, self._v = np.zeros(axes), np.zeros(axes)
 
     def read(self) -> tuple[Array, Array]:
-        """(n,) place [m, rad], (n,) velocity [m/s, rad/s].
+        """(n,) place [m] and behind it orientation, a rotation vector [rad]; (n,) velocity [m/s, rad/s].
 
         Raises:
             DriverError: the source is gone.
@@ -164,9 +171,11 @@ class RateMaster:
         return self._x.copy(), self._v.copy()
 
     def step(self, force: Array, dt: float) -> None:
-        """Go on by a period [s]; the force (n,) [N] is shown by the source as well as it can."""
+        """Go on by a period [s]; the force (n,) [N, N m] is shown by the source as well as it can."""
         self._v = self._v - math.expm1(-dt / self._smooth) * (self._wanted - self._v)
-        self._x = self._x + dt * self._v
+        self._x[:3] += dt * self._v[:3]
+        if len(self._x) == AXES:
+            self._x[3:] = turned(self._x[3:], dt * self._v[3:])
         self.source.feel(min(1.0, float(np.linalg.norm(force[:3])) / self.force_limit))
 
     def close(self) -> None:
@@ -187,7 +196,10 @@ class TerminalKeys:
     """
 
     name = "keys of this terminal"
-    usage = "w s or arrows forward and back, a d left and right, q e up and down; a key moves as long as it is down"
+    usage = (
+        "w s or arrows forward and back, a d left and right, q e up and down, i k j l u o turn; "
+        "a key moves as long as it is down"
+    )
     curve = Curve(dead=0.0, expo=0.0)
 
     def __init__(self, hold: float = 0.15, *, clock: Callable[[], float] = time.monotonic) -> None:
