@@ -216,6 +216,13 @@ def test_clocks_minutes_apart_hold_both_with_the_reason() -> None:
         (["master", "--connect", "x:99999"], "--connect"),
         (["master", "--master", "glove"], "--master"),
         (["master", "--key", "none"], "cannot be read"),
+        (["master", "--script", "wal"], "did you mean 'wall'"),
+        (["slave", "nowhere"], "scenes are wall, rigid"),
+        (["slav"], "did you mean 'slave'"),
+        (["run", "wall", "--mass", "2"], "--mass is for the scene lift"),
+        (["run", "free", "--arm", "so101", "--motion-scale", "2"], "one to one"),
+        (["slave", "--force-scale", "-1"], "--force-scale: expected a number above 0"),
+        (["run", "turn", "--torque", "-1"], "--torque: expected 0 N m or more"),
     ],
 )
 def test_wrong_words_are_one_line(

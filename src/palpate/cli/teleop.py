@@ -7,7 +7,7 @@ import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import numpy as np
 import typer
@@ -31,6 +31,7 @@ from ._common import (
 )
 from ._live import interruptible
 
+VERBS = ("run", "slave", "master", "devices", "key", "join")
 VIEW_S = 600.0
 """how long a viewed run is where nobody says [s]"""
 
@@ -297,13 +298,15 @@ def slave(
     from ..teleop.ends import SlaveEnd
     from ..teleop.setups import Shared, build_slave
 
+    place = _place(scene)
+    _scales(arm, motion_scale, force_scale)
     if scene == "lift":
         raise InputError("the objects of lift come by a script of both sides: palpate teleop run lift")
     faults = _faults(delay, jitter, loss, duplicate)
     channel = UdpChannel(read_key(key), "slave", 6, local=_address("--bind", bind), faults=faults, seed=seed)
     shared = Shared(_coupling(coupling), passivity, session=None)
     follower, side, _, _ = build_slave(
-        None if scene == "free" else scene,
+        place,
         arm=arm,
         shared=shared,
         stiffness=stiffness,
@@ -354,6 +357,7 @@ def master(
     from ..teleop.scenes import find
     from ..teleop.setups import Shared, build_master, scripted
 
+    path = _place(script)
     peer = _address("--connect", connect)
     here = peer[0] in ("127.0.0.1", "localhost")
     local = _address("--bind", bind) if bind is not None else ("127.0.0.1" if here else "0.0.0.0", 0)
@@ -362,10 +366,35 @@ def master(
     with ExitStack() as stack:
         held: Device | None = _moved(master, device, speed, stack)
         if held is None:
-            held = HapticDevice(scripted(None if script == "free" else find(script, np.zeros(3))))
+            held = HapticDevice(scripted(None if path is None else find(path, np.zeros(3))))
         channel = UdpChannel(read_key(key), "master", 6, local=local, peer=peer, faults=faults, seed=seed)
         end = MasterEnd(held, build_master(held, shared))
         return _serve(end, channel, record, seconds, json=json, quiet=quiet)
+
+
+def _place(scene: str) -> str | None:
+    """The name of what there is to touch; None: nothing."""
+    from ..teleop.scenes import SceneName
+
+    names = (*get_args(SceneName), "free")
+    if scene not in names:
+        close = suggest(scene, (*names, *VERBS), f"scenes are {', '.join(names)}; verbs")
+        raise InputError(f"no scene and no verb {scene!r}; {close}")
+    return None if scene == "free" else scene
+
+
+def _scales(arm: str, motion: float | None, force: float | None) -> None:
+    """Whether these can be had."""
+    from ..teleop.scenes import slave_arm
+
+    twins = slave_arm(arm).kind == "servos"
+    for option, value in (("--motion-scale", motion), ("--force-scale", force)):
+        if value is None:
+            continue
+        if twins:
+            raise InputError(f"{option}: {arm} is led joint by joint by its twin, one to one")
+        if not 0.0 < value < math.inf:
+            raise InputError(f"{option}: expected a number above 0, got {value:g}")
 
 
 def _moved(master: str, device: str | None, speed: float | None, stack: ExitStack) -> RateMaster | None:
@@ -531,7 +560,14 @@ def run(
     from ..teleop.record import rows, write_report
     from ..teleop.setups import build
 
-    chosen = _coupling(coupling)
+    place, chosen = _place(scene), _coupling(coupling)
+    _scales(arm, motion_scale, force_scale)
+    if mass and scene != "lift":
+        raise InputError(f"--mass is for the scene lift, and this is {scene}")
+    if torque is not None and (master != "hand" or not 0.0 <= torque < math.inf):
+        raise InputError(
+            f"--torque: expected 0 N m or more of the simulated device (--master hand), got {torque:g}"
+        )
     faults = _faults(delay, jitter, loss, duplicate)
     cuts = tuple(map(_cut, cut or ()))
     page, log = out / "report.html", out / "teleop.mcap"
@@ -543,7 +579,7 @@ def run(
     with ExitStack() as stack:
         moved = _moved(master, device, speed, stack)
         setup = build(
-            None if scene == "free" else scene,
+            place,
             arm=arm,
             coupling=chosen,
             stiffness=stiffness,
