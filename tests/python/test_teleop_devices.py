@@ -675,6 +675,28 @@ def test_keys_move_the_arm_from_the_command_line(tmp_path: Path) -> None:
     assert x[-1, 0] > 0.02 and np.abs(x[:, 1:]).max() == 0.0
 
 
+@pytest.mark.timeout(600)
+def test_a_process_of_its_own_is_moved_by_keys_and_says_what_is_felt(tmp_path: Path) -> None:
+    from palpate.teleop import make_key
+
+    here, there = pty.openpty()
+    arguments = ["master", "--master", "keyboard", "--seconds", "2", "--key", str(make_key(tmp_path / "key"))]
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "palpate.cli", "teleop", *arguments],
+            stdin=there,
+            capture_output=True,
+            text=True,
+            timeout=LONG_S,
+            check=False,
+        )
+    finally:
+        os.close(there)
+        os.close(here)
+    assert done.returncode == 0, done.stderr
+    assert "keys of this terminal: w s or arrows" in done.stdout and "; felt 0.0 N" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -364,12 +364,13 @@ def master(
     faults = _faults(delay, jitter, loss, duplicate)
     shared = Shared(_coupling(coupling), passivity, session=None)
     with ExitStack() as stack:
-        held: Device | None = _moved(master, device, speed, stack)
+        moved = _moved(master, device, speed, stack)
+        held: Device | None = moved
         if held is None:
             held = HapticDevice(scripted(None if path is None else find(path, np.zeros(3))))
         channel = UdpChannel(read_key(key), "master", 6, local=local, peer=peer, faults=faults, seed=seed)
         end = MasterEnd(held, build_master(held, shared))
-        return _serve(end, channel, record, seconds, json=json, quiet=quiet)
+        return _serve(end, channel, record, seconds, moved=moved, json=json, quiet=quiet)
 
 
 def _place(scene: str) -> str | None:
@@ -432,6 +433,7 @@ def _serve(
     record: Path | None,
     seconds: float | None,
     *,
+    moved: RateMaster | None = None,
     json: bool,
     quiet: bool,
 ) -> int:
@@ -451,6 +453,8 @@ def _serve(
         emit({"role": role, "host": host, "port": port})
     else:
         say(f"{role} at {host}:{port}   Ctrl-C ends")
+        if moved is not None:
+            say(f"{moved.source.name}: {moved.source.usage}")
     sys.stdout.flush()
     node = Node(end, channel, record=record, tell=lambda reason: line(f"! {reason or 'free again'}"))
     try:
@@ -458,7 +462,7 @@ def _serve(
             node.run(
                 stopped,
                 seconds=math.inf if seconds is None else seconds,
-                show=lambda state: line(str(state)),
+                show=lambda state: line(f"{state}{_waits(moved)}"),
             )
             ended = stopped() and seconds is not None
     finally:
@@ -467,6 +471,13 @@ def _serve(
     if json:
         emit({"gain": state.gain, "reason": state.reason, "refused": dict(state.refused), "loss": state.loss})
     return STOPPED if ended else 0
+
+
+def _waits(moved: RateMaster | None) -> str:
+    """What a person sees of what he moves, behind the state of the link."""
+    if moved is None:
+        return ""
+    return f"; felt {moved.felt:.1f} N" + (f"; {moved.status}" if moved.status else "")
 
 
 def _address(option: str, text: str) -> tuple[str, int]:

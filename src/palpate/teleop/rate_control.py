@@ -146,6 +146,8 @@ class RateMaster:
         self.source, self.force_limit = source, force_limit
         self.status = ""
         """what must be done before it moves, for people; empty: it does"""
+        self.felt = 0.0
+        """size of the force that is shown [N]"""
         self._smooth = smooth
         self._most = np.array([speed] * 3 + [turning] * (axes - 3))
         self._wanted = np.zeros(axes)
@@ -176,7 +178,8 @@ class RateMaster:
         self._x[:3] += dt * self._v[:3]
         if len(self._x) == AXES:
             self._x[3:] = turned(self._x[3:], dt * self._v[3:])
-        self.source.feel(min(1.0, float(np.linalg.norm(force[:3])) / self.force_limit))
+        self.felt = float(np.linalg.norm(force[:3]))
+        self.source.feel(min(1.0, self.felt / self.force_limit))
 
     def close(self) -> None:
         """Let go of the source."""
