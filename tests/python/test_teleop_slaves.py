@@ -250,11 +250,12 @@ def test_a_resting_motor_changes_its_friction_and_not_the_touch() -> None:
             1e-3,
             seen,
         )
-    assert np.abs(split.touch)[[0, 1, 2, 4]].max() < 1.0
+    settling = split.touch
     split = _Split(model)
     for k in range(400):
         split.step(np.full(6, 2.0 * k / 400), np.ones(6), np.zeros(6), lever, 0.0, 1e-3, seen)
-    assert np.abs(split.touch).min() > 1.0
+    # a motor that never moved kept its friction: the same residual presses more than where friction turned over
+    assert np.all(0.0 <= settling) and np.all(settling[[0, 1, 2, 4]] < 0.9 * split.touch[[0, 1, 2, 4]])
     assert np.all(split.variance > 0.0)
 
 

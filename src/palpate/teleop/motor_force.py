@@ -32,7 +32,7 @@ BEFORE = 0.012
 """so long a glitch spoils currents before anything shows it [s]"""
 CATCH_UP = 2.0 / KINEMATIC
 """how long the currents' low-pass needs after a glitch [s]"""
-PER_WAY, PER_TIME = 158.0, 10.0
+PER_WAY, PER_TIME = 158.0, 2.0
 """how much a touch may change: by 5 N over a millimetre of the tool's way, as against 5 kN/m [N/sqrt(m)]; by itself
 [N/sqrt(s)]"""
 MOMENT = 0.2
@@ -243,7 +243,8 @@ class _Split:
         self._model = model
         self.touch, self._error = np.zeros(n), np.zeros(n)
         # variance of the touch, of the error, and their covariance
-        self.variance, self._own = np.zeros(n), model.sliding_std**2 + model.turning_std**2
+        self._own = model.sliding_std**2 + model.turning_std**2
+        self.variance = self._own.copy()
         self._both = np.zeros(n)
 
     def step(
