@@ -26,6 +26,7 @@ from palpate.studies._geared_arm import Run, simulate
 from palpate.studies._irb2400_force import late
 from palpate.studies._teleop_hands import free, pressing
 from palpate.studies._teleop_slaves import contact, held_torque, led
+from palpate.teleop.channel import Faults
 from palpate.teleop.figures import transparency
 from palpate.teleop.industrial import SENSORS
 from palpate.teleop.motor_force import LowPass, MotorForce, MotorModel, _Split, identified
@@ -212,6 +213,12 @@ def test_the_so101_follows_its_twin_and_the_hand_feels_a_touch() -> None:
     pressed = build("wall", arm="so101", stiffness=draw.stiffness, hand=draw.hand, seed=1).run(seconds=5.5)
     felt, estimated, true = held_torque(pressed)
     assert true > 0.5 and felt < 0.1 and estimated < 0.1
+
+
+@pytest.mark.slow
+def test_whole_counts_over_a_delay_do_not_empty_a_tank_beyond_its_bottom() -> None:
+    run = build("wall", arm="so101").run(seconds=8.0, faults=Faults(delay=0.02))
+    assert min(tank["lowest"] for tank in run.tanks.values()) >= 0.0
 
 
 def test_a_servo_at_rest_keeps_its_touch_and_one_that_turns_back_and_forth_tells_it() -> None:

@@ -291,7 +291,7 @@ def _leading(n: int, device: Device, shared: Shared) -> MasterSide:
         contact_damping=0.3,
         hold_stiffness=5.0,
         hold_damping=0.1,
-        acceleration=200.0,
+        acceleration=2000.0,  # encoders tell a whole count, 1.5 mrad, within a period: its work comes in one lump
         resync_rate=10.0,
         **shared.options(),
     )
