@@ -278,6 +278,7 @@ def test_the_command_writes_a_report_and_one_log_of_both_sides(
         (["wall", "--cut", "soon"], "--cut"),
         (["wall", "--loss", "2"], "loss"),
         (["wall", "--seconds", "-1"], "seconds"),
+        (["turn", "--arm", "so101"], "led joint by joint"),
     ],
 )
 def test_wrong_input_is_one_line(

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arm import Array
 from ..teleop.figures import SETTLED
-from ..teleop.masters import Hand
+from ..teleop.masters import Hand, HapticDevice
 from ..teleop.scenes import SlaveArm, smooth, through
 from ..teleop.servo_arms import joint_path
 from ..teleop.setups import JOINT_HAND
@@ -23,6 +23,8 @@ GAP = 0.05
 """from the tool to the wall at the start [m]"""
 STIFFNESS_SPREAD = 0.15
 """the walls' stiffness is off the nominal one by up to so much [1]"""
+SHOWN = 0.8
+"""part of the device's largest force that a hand presses with at most [1]"""
 HELD = 2.5
 """so long the hand presses [s]"""
 
@@ -44,21 +46,20 @@ class Draw:
     seconds: float
 
 
-def _held(rng: np.random.Generator, chosen: SlaveArm, path: Callable[[float], Array], seconds: float) -> Hand:
-    """A hand of any grip that goes along a path of the slave's tool, from its start (3,) [m]."""
-    mass, stiffness, damping, tremor = rng.uniform(0.75, 1.25, 4)
-    rate = float(rng.uniform(8.0, 12.0))
-    joints = chosen.kind == "servos"
-    of = JOINT_HAND if joints else {"mass": 0.5, "stiffness": 400.0, "damping": 14.0, "tremor": 0.05}
-    scale = chosen.motion_scale
-    return Hand(
-        wish=joint_path(chosen.arm, chosen.q, path, seconds) if joints else lambda t: path(t) / scale,
-        mass=float(mass) * of["mass"],
-        stiffness=float(stiffness) * of["stiffness"],
-        damping=float(damping) * of["damping"],
-        tremor=float(tremor) * of["tremor"],
-        tremor_rate=rate,
-    )
+def _grip(rng: np.random.Generator, chosen: SlaveArm) -> dict[str, float]:
+    """How a hand holds the device: options of :class:`Hand`."""
+    usual = {"mass": 0.5, "stiffness": 400.0, "damping": 14.0, "tremor": 0.05}
+    of = JOINT_HAND if chosen.kind == "servos" else usual
+    drawn = rng.uniform(0.75, 1.25, 4)
+    grip = {name: float(part) * of[name] for name, part in zip(usual, drawn, strict=True)}
+    return {**grip, "tremor_rate": float(rng.uniform(8.0, 12.0))}
+
+
+def _held(grip: dict[str, float], chosen: SlaveArm, path: Callable[[float], Array], seconds: float) -> Hand:
+    """A hand that goes along a path of the slave's tool, from its start (3,) [m]."""
+    if chosen.kind == "servos":
+        return Hand(wish=joint_path(chosen.arm, chosen.q, path, seconds), **grip)
+    return Hand(wish=lambda t: path(t) / chosen.motion_scale, **grip)
 
 
 def free(chosen: SlaveArm, seed: int, radius: float, seconds: float) -> Draw:
@@ -84,11 +85,11 @@ def free(chosen: SlaveArm, seed: int, radius: float, seconds: float) -> Draw:
         )
         return place
 
-    return Draw(seed, _held(rng, chosen, path, seconds), math.nan, seconds)
+    return Draw(seed, _held(_grip(rng, chosen), chosen, path, seconds), math.nan, seconds)
 
 
 def pressing(chosen: SlaveArm, seed: int, stiffness: float, press: float) -> Draw:
-    """To any place of the wall, into it, some seconds there, and back.
+    """To any place of the wall, into it, some seconds there, and back; no harder than the device can show.
 
     Args:
         chosen: the slave.
@@ -103,6 +104,13 @@ def pressing(chosen: SlaveArm, seed: int, stiffness: float, press: float) -> Dra
     there = SETTLED + float(rng.uniform(0.8, 1.2))
     into = there + float(rng.uniform(1.0, 1.6))
     back = into + HELD + float(rng.uniform(1.5, 2.0))
+    grip = _grip(rng, chosen)
+    if (
+        chosen.kind != "servos"
+    ):  # a hand that is stronger than the device goes on into the wall, whatever it feels
+        deep = min(
+            deep, GAP + SHOWN * HapticDevice(Hand()).force_limit / grip["stiffness"] * chosen.motion_scale
+        )
     path = through(
         [
             (SETTLED, (0.0, 0.0, 0.0)),
@@ -112,4 +120,4 @@ def pressing(chosen: SlaveArm, seed: int, stiffness: float, press: float) -> Dra
             (back, (0.0, side, up)),
         ]
     )
-    return Draw(seed, _held(rng, chosen, path, back + 0.5), K, back + 0.5)
+    return Draw(seed, _held(grip, chosen, path, back + 0.5), K, back + 0.5)

@@ -18,8 +18,9 @@ from ._rows import at_most, told
 from ._teleop_slaves import ABB, IIWA
 
 JOBS, QUICK_JOBS = 4, 2
-_WOBBLE = np.array([0.3, 0.25, 0.4]), np.array([2.0, 1.7, 2.4])
-"""amplitudes [rad] and rates [rad/s] of the wrist about three axes"""
+_WOBBLE = np.array([0.25, 0.2, 0.3]), np.array([2.0, 1.7, 2.4])
+"""amplitudes [rad] and rates [rad/s] of the wrist about three axes; with a fifth more the iiwa's fourth joint reaches its
+largest speed on the way"""
 
 
 def circle(time: float) -> Array:

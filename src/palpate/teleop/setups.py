@@ -138,6 +138,10 @@ def build(
     """
     chosen = slave_arm(arm)
     motion_scale = chosen.motion_scale if motion_scale is None else motion_scale
+    if scene == "turn" and chosen.kind == "servos":
+        raise InputError(
+            f"turn: {arm} is led joint by joint by its twin, nothing turns a key in its place; take another arm"
+        )
     shared = Shared(coupling, passive)
     slave, follower, place, assumed = build_slave(
         scene,
