@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,7 @@ class Draw:
     seconds: float
 
 
-def _grip(rng: np.random.Generator, chosen: SlaveArm) -> dict[str, float]:
+def _grip(rng: np.random.Generator, chosen: SlaveArm) -> dict[str, Any]:
     """How a hand holds the device: options of :class:`Hand`."""
     usual = {"mass": 0.5, "stiffness": 400.0, "damping": 14.0, "tremor": 0.05}
     of = JOINT_HAND if chosen.kind == "servos" else usual
@@ -55,7 +56,7 @@ def _grip(rng: np.random.Generator, chosen: SlaveArm) -> dict[str, float]:
     return {**grip, "tremor_rate": float(rng.uniform(8.0, 12.0))}
 
 
-def _held(grip: dict[str, float], chosen: SlaveArm, path: Callable[[float], Array], seconds: float) -> Hand:
+def _held(grip: dict[str, Any], chosen: SlaveArm, path: Callable[[float], Array], seconds: float) -> Hand:
     """A hand that goes along a path of the slave's tool, from its start (3,) [m]."""
     if chosen.kind == "servos":
         return Hand(wish=joint_path(chosen.arm, chosen.q, path, seconds), **grip)

@@ -19,8 +19,8 @@ from ._teleop_slaves import ABB, IIWA
 
 JOBS, QUICK_JOBS = 4, 2
 _WOBBLE = np.array([0.25, 0.2, 0.3]), np.array([2.0, 1.7, 2.4])
-"""amplitudes [rad] and rates [rad/s] of the wrist about three axes; with a fifth more the iiwa's fourth joint reaches its
-largest speed on the way"""
+"""amplitudes [rad] and rates [rad/s] of the wrist about three axes; a fifth more, and the iiwa's fourth joint would
+reach its largest speed on the way"""
 
 
 def circle(time: float) -> Array:
