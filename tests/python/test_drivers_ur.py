@@ -193,15 +193,10 @@ class TestCommanding:
             until(lambda: not ur.tell("state")["program"])
             assert ur.tell("state")["mode"] == "hold"
 
-            def told() -> bool:
-                following(driver)  # a package may be older than the end of the program
-                try:
-                    driver.speed([0.3, 0, 0, 0, 0, 0])
-                except DriverError as error:
-                    return "control program on the robot has ended" in str(error)
-                return False
-
-            until(told)
+            # a package may be older than the end of the program
+            until(lambda: following(driver) is not None and driver.state == "connected")
+            with pytest.raises(DriverError, match="control program on the robot has ended"):
+                driver.speed([0.3, 0, 0, 0, 0, 0])
             driver.enable()
             following(driver)
             driver.speed([0.0] * 6)
