@@ -330,18 +330,22 @@ TEST(TeleopWaves, AConstantDelayTakesNothingAndMakesNothing) {
   }
 }
 
+void expect_lawful(const EpisodeConfig& c, const EpisodeResult& r, std::uint64_t seed) {
+  EXPECT_LE(r.generated, 2.0 * c.tank.initial) << seed;
+  EXPECT_GE(r.lowest, 0.0) << seed;
+  EXPECT_LE(r.force, c.force_limit * (1.0 + 1e-12)) << seed;
+  EXPECT_LE(r.speed, c.speed * (1.0 + 1e-9)) << seed;
+  EXPECT_LE(r.force_jump, 2.0) << seed;
+  EXPECT_EQ(r.hold_motion, 0.0) << seed;
+  EXPECT_TRUE(r.finite) << seed;
+}
+
 TEST(TeleopEpisodes, NoEnergyIsMadeAndNoLimitBroken) {
   int shaking = 0;
   for (std::uint64_t seed = 0; seed < 60; ++seed) {
     EpisodeConfig c = random_episode(seed);
     const EpisodeResult r = run_episode(c, seed);
-    EXPECT_LE(r.generated, 2.0 * c.tank.initial) << seed;
-    EXPECT_GE(r.lowest, 0.0) << seed;
-    EXPECT_LE(r.force, c.force_limit * (1.0 + 1e-12)) << seed;
-    EXPECT_LE(r.speed, c.speed * (1.0 + 1e-9)) << seed;
-    EXPECT_LE(r.force_jump, 2.0) << seed;
-    EXPECT_EQ(r.hold_motion, 0.0) << seed;
-    EXPECT_TRUE(r.finite) << seed;
+    expect_lawful(c, r, seed);
     c.layer = Layer::none;
     shaking += run_episode(c, seed).generated > 0.1;
   }
@@ -656,13 +660,7 @@ TEST(TeleopEpisodes, OfAPoseMakeNoEnergyAndBreakNoLimit) {
     EpisodeConfig c = random_episode(seed);
     c.pose = true;
     const EpisodeResult r = run_episode(c, seed);
-    EXPECT_LE(r.generated, 2.0 * c.tank.initial) << seed;
-    EXPECT_GE(r.lowest, 0.0) << seed;
-    EXPECT_LE(r.force, c.force_limit * (1.0 + 1e-12)) << seed;
-    EXPECT_LE(r.speed, c.speed * (1.0 + 1e-9)) << seed;
-    EXPECT_LE(r.force_jump, 2.0) << seed;
-    EXPECT_EQ(r.hold_motion, 0.0) << seed;
-    EXPECT_TRUE(r.finite) << seed;
+    expect_lawful(c, r, seed);
     if (seed >= 6) continue;
     c.layer = Layer::none;
     shaking += run_episode(c, seed).generated > 0.1;
