@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -461,6 +462,17 @@ def test_doctor_finds_everything_here(palpate) -> None:
     for extra in ("cli", "card", "sim", "report", "dynamixel", "feetech"):
         assert found[f"extra {extra}"]["ok"] is True
     assert "µs" in found["C++ core"]["found"]
+
+
+def test_doctor_knows_every_extra(palpate) -> None:
+    """Those a user asks for by what they bring; the others are bundles."""
+    found = {f["what"] for f in palpate("doctor", "--json").json["findings"]}
+    extras = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    assert {f"extra {name}" for name in extras if name not in ("all", "test", "docs", "bench", "dev")} == {
+        what for what in found if what.startswith("extra ")
+    }
 
 
 def test_doctor_tells_what_is_missing(palpate, monkeypatch: pytest.MonkeyPatch) -> None:
