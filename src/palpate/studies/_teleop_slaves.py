@@ -139,8 +139,9 @@ def industrial(quick: bool, done: Callable[[], None]) -> list[Row]:
                 f"{_largest(c.estimated for c in found):.2f} N",
                 beside=f"<= {BAR:g}",
             ),
-            told(
+            at_most(
                 f"{walls}: felt after the touch",
+                20.0,
                 1e3 * _largest(onset),
                 "ms",
                 "two low-passes are 21 ms late, and a force is felt from three standard deviations on",
