@@ -4,7 +4,7 @@ Takes about half a minute; without a display set MUJOCO_GL=egl.
 
 Prints:
     the other arm holds the board
-    pass 1: 1 strokes, about 4 s
+    pass 1: 1 stroke of 1 straight piece, about 4 s
     clean: 0.0 % of the ink left after 1 pass
     commanded force never above 5 N: True
 """
