@@ -349,7 +349,7 @@ class PayloadFilter {
   /// A push is no load: its torques stand to each other as no load's do. What the state lacks to follow the positions, as a
   /// torque (JointKalman::torque_of), is averaged over the last 0.3 s, and over 3 s as long as it stays the same:
   ///   rho = mean(lacking - D theta^ + b^) + mean(D) theta^ ~ N(0, V),   D the torque per unit of theta, theta^ the estimate,
-  ///   V = noise/N + (W cov(q') W + var(B q))(begin, end)/span^2 + var(b) + mean(D) P mean(D)^T
+  ///   V = noise/N + (W cov(q') W^T + var(B q))(begin, end)/span^2 + mean(var(b)) + mean(D) P mean(D)^T
   /// where a load is all there is. If rho^T V^-1 rho says otherwise, any part of what looks like a load may
   /// be none: a parameter is then not known better than rho^2/D^2, the change that would take as much torque, times
   /// n/(n - parameters), for so much of a torque the fit has taken on itself. When it is over, what was learnt meanwhile is as

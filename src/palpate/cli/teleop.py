@@ -683,7 +683,22 @@ def _cut(text: str) -> Cut:
     return found
 
 
-class _Pilot:
+class _Line:
+    """A line of the terminal that tells how it goes until the end; nothing where there is no terminal."""
+
+    _status: Any = None
+
+    def _begin_line(self) -> None:
+        if console().is_terminal:
+            self._status = console().status("starting")
+            self._status.start()
+
+    def __exit__(self, *_: object) -> None:
+        if self._status is not None:
+            self._status.stop()
+
+
+class _Pilot(_Line):
     """Real time for a person without a page: where the arm is and what it feels, in one line of the terminal."""
 
     def __init__(self, moved: RateMaster, faults: Faults | None, *, silent: bool) -> None:
@@ -694,20 +709,13 @@ class _Pilot:
         self._moved, self._silent, self._pace = moved, silent, Pace()
         self._wish = Wish(faults or Faults())
         self._said = ""
-        self._status: Any = None
 
     def __enter__(self) -> _Pilot:
         if not self._silent:
             say(f"{self._moved.source.name}: {self._moved.source.usage}   Ctrl-C ends")
             sys.stdout.flush()
-            if console().is_terminal:
-                self._status = console().status("starting")
-                self._status.start()
+            self._begin_line()
         return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._status is not None:
-            self._status.stop()
 
     def tap(self, k: int, run: Run) -> Wish:
         """At the end of every period."""
@@ -728,23 +736,17 @@ class _Pilot:
         return self._wish
 
 
-class _Bar:
+class _Bar(_Line):
     """How far the simulation is and when it will be done; without a terminal a line on stderr every half minute."""
 
     def __init__(self, *, silent: bool) -> None:
         self._silent = silent
         self._begin = self._told = time.monotonic()
-        self._status: Any = None
 
     def __enter__(self) -> _Bar:
-        if not self._silent and console().is_terminal:
-            self._status = console().status("starting")
-            self._status.start()
+        if not self._silent:
+            self._begin_line()
         return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._status is not None:
-            self._status.stop()
 
     def __call__(self, done: float, whole: float) -> None:
         spent = time.monotonic() - self._begin

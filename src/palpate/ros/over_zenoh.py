@@ -1,7 +1,7 @@
 """The ROS graph over Zenoh, as rmw_zenoh_cpp lays it out.
 
-A topic is the key ``domain/name/type/hash``, its messages are CDR with who wrote them, when, and the how manieth it was
-beside; a service is a queryable of such a key; nodes and what they read, write and serve are liveliness tokens below
+A topic is the key ``domain/name/type/hash``, its messages are CDR, and beside each stand its writer, its time and its
+number; a service is a queryable of such a key; nodes and what they read, write and serve are liveliness tokens below
 ``@ros2_lv/domain``; what is latched is kept by the advanced publisher. Source: the design document of ros2/rmw_zenoh.
 """
 
@@ -187,7 +187,7 @@ class _Place(NamedTuple):
 
 
 class _Origin(NamedTuple):
-    """Who wrote a message, when, and the how manieth it was."""
+    """Who wrote a message, when, and its number."""
 
     sequence: int
     source_timestamp: int
