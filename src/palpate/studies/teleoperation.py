@@ -21,7 +21,7 @@ from ..teleop.setups import build
 from ..teleop.slaves import STIFFEST
 from . import Progress, Row, _figures, _teleop_slaves, _teleop_turning
 from ._rows import at_most, told
-from ._teleop_hands import JUDGED, free, pressing
+from ._teleop_hands import JUDGED, SHOWN, free, pressing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -111,7 +111,8 @@ def run(progress: Progress, quick: bool) -> tuple[list[Row], Mapping[str, Figure
         "0.03 mm, held by a hand of 0.5 kg, "
         "400 N/m, 14 N s/m with tremor. Every message goes through the encrypted packets of the channel.",
         "Hands of different grip, tremor, way and place, with other sensors' noise and walls up to 15 % off, judge "
-        f"(seeds {', '.join(map(str, JUDGED))}); nothing was chosen by them. The SO-101's and the ABB's estimators "
+        f"(seeds {', '.join(map(str, JUDGED))}); no setting was chosen by them, and they press with no more than "
+        f"{SHOWN:.0%} of what the device can show. The SO-101's and the ABB's estimators "
         "were designed on hands that go straight ahead, sensor seeds 0 and 5 to 7, and on seeds 1, 2 and 4.",
         "True forces are those of MuJoCo's contacts. Force felt and true are compared over tenths of a "
         "second while the hand holds.",
