@@ -89,9 +89,11 @@ def main() -> None:
         return float(np.mean(weight * (np.logaddexp(0.0, z) - y * z)) + KEEP * w[:-1] @ w[:-1])
 
     w = minimize(loss, np.zeros(scaled.shape[1])).x
-    right = (scaled @ w > 0.0) == (y > 0.0)
-    print(f"{int(y.sum())} seams, {100 * right[y > 0].mean():.0f} % told; {int((y == 0).sum())} other bands, "
-          f"{100 * right[y == 0].mean():.0f} % told")  # fmt: skip
+    print(f"{int(y.sum())} seams, {int((y == 0).sum())} other bands")
+    for name, odds in (("these weights", scaled @ w), ("those of _seams", x @ _seams.WEIGHTS + _seams.BIAS)):
+        right = (odds > 0.0) == (y > 0.0)
+        print(f"{name}: {100 * right[y > 0].mean():.0f} % of the seams told, {100 * right[y == 0].mean():.0f} % of the "
+              f"others; loss {np.mean(weight * (np.logaddexp(0.0, odds) - y * odds)):.4f}")  # fmt: skip
     weights = w[:-1] / spread
     print("WEIGHTS =", np.round(weights, 1).tolist(), "BIAS =", round(float(w[-1] - weights @ middle), 1))
 

@@ -54,6 +54,7 @@ FEATURES = (
 )
 WEIGHTS = np.array([2.0, 2.0, -1.1, 1.7])
 BIAS = 8.4
+"""fitted to other views than scripts/fit_seam_weights.py draws, which says how they do beside its own"""
 
 
 @dataclass(frozen=True, slots=True)
